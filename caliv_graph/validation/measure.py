@@ -36,6 +36,16 @@ POLE_TRUE_M = 0.005
 """Deviation of a wall from a plane over metres, and of a pole from a cylinder, 1 sigma. It includes
 range errors that depend on angle and material, and makes LiDARs with different views differ."""
 
+RELIEF_CELL_M = 1.0
+"""Edge of the cells of a wall whose deviations from its plane count as independent: reveals of
+windows, pillars, bricks that bulge."""
+
+RELIEF_POINTS = 5
+"""Fewest points of a cell that tell its deviation."""
+
+RELIEF_CELLS = 4
+"""Fewest cells that tell the relief of a wall: a plane has three coordinates."""
+
 NEIGHBOURS = 8
 """Number of points of the other LiDAR that define its surface near a point."""
 
@@ -178,8 +188,41 @@ class SurfaceMeter:
             return np.zeros((0, 1, 3))
         return np.column_stack([np.ones(int(inside.sum())), place[inside]])[:, None, :]
 
-    def expect(self, placed: Placed, errors: Errors) -> Expected:
-        """Expectation of `measure` under the known errors alone."""
+    def relief_m(
+        self, placed: Placed, poses: Sequence[gtsam.Pose3] | None, sigma_range_m: float
+    ) -> float:
+        """Root mean square deviation of a wall from its plane over cells, beyond noise; metres.
+
+        0 for a pole, and where too few cells tell it. To be asked for at the best alignment: at
+        another one, a wrong extrinsic would count as relief.
+        """
+        if not isinstance(self._surface, Wall):
+            return 0.0
+        points = self._clouds.points_map(placed, poses)[self._surface.members]
+        beams = self._clouds.beams_map(placed, poses)[self._surface.members]
+        merged = _refitted(points, beams, self._surface)
+        residual, normal, _ = linearised(merged.surface, points)
+        variance = (sigma_range_m * np.einsum("ni,ni->n", beams, normal)) ** 2
+        cell, count = self._cells(points)
+        told = count >= RELIEF_POINTS
+        if told.sum() < RELIEF_CELLS:
+            return 0.0
+        mean = np.bincount(cell, residual)[told] / count[told]
+        of_noise = np.bincount(cell, variance)[told] / count[told] ** 2
+        freedom = (told.sum() - 3) / told.sum()
+        return float(np.sqrt(max(np.mean(mean**2) / freedom - np.mean(of_noise), 0.0)))
+
+    def _cells(self, points_map: Array) -> tuple[IntArray, IntArray]:
+        """Cell of a wall of each point (n,), and the number of points in each cell."""
+        assert isinstance(self._surface, Wall)
+        place = (points_map - self._surface.centre) @ self._surface.axes.T
+        _, cell, count = np.unique(
+            np.floor(place / RELIEF_CELL_M), axis=0, return_inverse=True, return_counts=True
+        )
+        return cell.ravel(), count
+
+    def expect(self, placed: Placed, errors: Errors, relief_m: float = 0.0) -> Expected:
+        """Expectation of `measure` under the known errors alone; `relief_m` as measured."""
         clouds, members = self._clouds, self._surface.members
         names = clouds.lidars
         poses = [placed.extrinsics.T_vehicle_lidar[name] for name in names]
@@ -199,7 +242,7 @@ class SurfaceMeter:
             J = _sparse(by_extrinsic[which], self._lidar[which], len(names))
             square = _scatter(J, errors.cov_extrinsics, basis[which])
             square += _scatter_of_scans(by_pose[which], scan[which], errors.cov_poses, basis[which])
-            return float(np.sqrt(square + variance[which].mean() + of_shape**2))
+            return float(np.sqrt(square + variance[which].mean() + of_shape**2 + relief_m**2))
 
         everything = np.ones(len(members), dtype=bool)
         alone = {names[i]: thickness(self._lidar == i) for i in self._own}
@@ -218,6 +261,11 @@ class SurfaceMeter:
             row[:, len(errors.cov_extrinsics) :] = into.reshape(columns, -1)
             rows_of[names[i]] = row
             noise_of[names[i]] = (gain * variance[which]) @ gain.T
+            if relief_m:
+                # Each LiDAR sees other cells, and other points in them.
+                cell, count = self._cells(points[which])
+                shares = np.stack([np.bincount(cell, g, len(count)) for g in gain])
+                noise_of[names[i]] += relief_m**2 * shares @ shares.T
         distance, rows, noise = {}, {}, {}
         for a, b in self.pairs():
             at = self._where(merged, a, b)

@@ -304,7 +304,9 @@ def _surfaces(
                 meter.points,
                 {stage: thickness for stage, (thickness, _) in found.items()},
                 {stage: apart for stage, (_, apart) in found.items()},
-                meter.expect(stages[AFTER][0], errors),
+                meter.expect(
+                    stages[AFTER][0], errors, meter.relief_m(*stages[BEST], errors.sigma_range_m)
+                ),
             )
         )
     return out

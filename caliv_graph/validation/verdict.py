@@ -11,6 +11,7 @@ from scipy.special import chdtrc
 from caliv_graph.validation.findings import (
     AFTER,
     BEFORE,
+    BEST,
     STAGES,
     WITHOUT,
     HeldOutStructure,
@@ -47,6 +48,9 @@ THICK = 2.0
 wrong rotation moves a surface from scan to scan, and hardly the mean distance from another LiDAR's.
 """
 
+IRREGULAR = 2.0
+"""The same of one surface at the best alignment, from which it tests nothing."""
+
 CONTRADICTION = 5.7e-7
 """Probability beyond 5 sigma. Below it the data contradict each other, which is exit code 4."""
 
@@ -55,6 +59,14 @@ def is_shared(surface: SurfaceResult, pair: Pair) -> bool:
     """Whether the distance of two LiDARs on a surface is measurable at all stages."""
     stages = [surface.expected.distance_m, *surface.apart.values()]
     return all(pair in of_stage for of_stage in stages)
+
+
+def is_irregular(surface: SurfaceResult, lidar: str) -> bool:
+    """Whether what a LiDAR sees of a surface is far thicker than it is even at the best alignment.
+
+    Corners of cars, leaves, the edge of something else: its distance says nothing of extrinsics.
+    """
+    return surface.thickness[BEST].alone[lidar] > IRREGULAR * surface.expected.alone[lidar]
 
 
 def judge(
@@ -184,7 +196,11 @@ def _tested(surfaces: Sequence[SurfaceResult]) -> list[tuple[SurfaceResult, Pair
     """Linearly independent offsets: of n LiDARs on a wall, n - 1."""
     out = []
     for surface in surfaces:
-        pairs = [pair for pair in surface.apart[AFTER] if is_shared(surface, pair)]
+        pairs = [
+            pair
+            for pair in surface.apart[AFTER]
+            if is_shared(surface, pair) and not any(is_irregular(surface, name) for name in pair)
+        ]
         hub = max(surface.points, key=lambda name: surface.points[name])
         out += [(surface, pair) for pair in pairs if hub in pair]
     return out

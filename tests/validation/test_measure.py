@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.geometry.se3 import retract_vehicle_axes
+from caliv_graph.geometry.se3 import retract_vehicle_axes, stack
 from caliv_graph.products import Array
 from caliv_graph.trajectory.select import smooth_trajectories
 from caliv_graph.validation import measure
@@ -24,7 +24,7 @@ from caliv_graph.validation.refine import (
     extrinsic_jacobian,
     pose_jacobian,
 )
-from caliv_graph.validation.surfaces import Structure, find_structure
+from caliv_graph.validation.surfaces import Structure, Wall, find_structure
 from tests.samples import pose
 from tests.validation.scenes import MOUNTINGS, make_config, make_recording
 
@@ -129,6 +129,41 @@ def test_what_is_expected_is_what_errors_of_the_known_size_give(
     noise = np.array([meter.measure(placed)[0].alone["front"] ** 2 for meter in meters])
     thick = np.sqrt(np.mean(alone, axis=0) - noise)
     assert thick[:2] == pytest.approx([e.alone["front"] for e in expected[:2]], rel=0.3)
+
+
+def test_relief_of_a_wall_is_found_and_widens_what_is_expected(
+    clouds: Clouds, structure: Structure
+) -> None:
+    """Fronts of houses: reveals and pillars of 20 mm, a metre wide."""
+    placed = clouds.placed["after"]
+    errors = Errors(np.zeros((12, 12)), np.zeros((6 * len(placed.taken_ns),) * 2), 0.01)
+    pair = ("front", "rear")
+    rng = np.random.default_rng(8)
+    for surface in structure.surfaces:
+        meter = SurfaceMeter(clouds, surface)
+        flat_m = meter.relief_m(placed, None, 0.01)
+        assert flat_m < 0.003
+        if not isinstance(surface, Wall):
+            assert flat_m == 0.0
+            continue
+        members = surface.members
+        place = (clouds.points_map(placed)[members] - surface.centre) @ surface.axes.T
+        cell = np.unique(np.floor(place), axis=0, return_inverse=True)[1].ravel()
+        bulge = 0.02 * rng.standard_normal(cell.max() + 1)[cell]
+        points = placed.points_lidar.copy()
+        R_vehicle, _ = stack(poses_of(clouds))
+        R = placed.R_map_vehicle[clouds.scan[members]] @ R_vehicle[clouds.lidar[members]]
+        points[members] += np.einsum("nji,nj->ni", R, bulge[:, None] * surface.normal)
+        rough = replace(placed, points_lidar=points)
+
+        relief_m = meter.relief_m(rough, None, 0.01)
+
+        assert relief_m == pytest.approx(0.02, rel=0.35)
+        usual, wide = meter.expect(rough, errors), meter.expect(rough, errors, relief_m)
+        assert wide.distance_m[pair] > 1.5 * usual.distance_m[pair]
+        thickness, apart = meter.measure(rough)
+        assert apart[pair].distance_m < 2.5 * wide.distance_m[pair]
+        assert thickness.alone["front"] == pytest.approx(wide.alone["front"], rel=0.35)
 
 
 def test_cloud_distance_of_two_plates() -> None:

@@ -15,7 +15,7 @@ from caliv_graph.validation.findings import AFTER, BEFORE, BEST, Validation, Ver
 from caliv_graph.validation.measure import Errors
 from caliv_graph.validation.surfaces import Pole, Wall
 from caliv_graph.validation.validate import validate
-from caliv_graph.validation.verdict import judge
+from caliv_graph.validation.verdict import is_irregular, judge
 from tests.drives_with_chair import Memory
 from tests.validation.scenes import (
     BOX_XY,
@@ -133,6 +133,21 @@ def test_a_lidar_whose_own_walls_are_thick_is_not_called_good(
         "By 'front' alone walls and poles are more than twice as thick"
         in (verdict(2.1).sentences[-1])
     )
+
+
+def test_a_surface_that_is_thick_at_the_best_alignment_tests_nothing(right: Validation) -> None:
+    """The corner of a parked car, of which one LiDAR sees a few points."""
+    (wall, *others) = right.surfaces
+    best = wall.thickness[BEST]
+    thick = replace(best, alone={**best.alone, "front": 2.1 * wall.expected.alone["front"]})
+    irregular = replace(wall, thickness={**wall.thickness, BEST: thick})
+    assert not is_irregular(wall, "front")
+    assert is_irregular(irregular, "front")
+    assert not is_irregular(irregular, "rear")
+    errors = Errors(np.zeros((12, 12)), np.zeros((6 * sum(right.scans.values()),) * 2), 0.01)
+    alone = (right.alone_m, right.expected_alone_m)
+    measured = ((irregular, *others), right.things, right.pairs)
+    assert judge(*measured, alone, errors, right.before).dof == right.verdict.dof - 1
 
 
 def test_an_error_that_all_lidars_share_is_seen() -> None:

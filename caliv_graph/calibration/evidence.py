@@ -78,6 +78,7 @@ class Evidence:
         effects: per drive, the columns of its poses in `by_pose`, and what errors do to them.
         motion: per drive, what its motion data and its structure say of these errors.
         sensor_sigmas: kind of sensor -> (3,) white 1 sigma of one measurement, map axes.
+        stated_over_white: of these, how many times as much its driver states, at most; none is 1.
     """
 
     observed: Observed
@@ -86,6 +87,7 @@ class Evidence:
     effects: list[tuple[IntArray, dict[str, ErrorEffects]]] = field(default_factory=list)
     motion: list[ErrorLikelihood] = field(default_factory=list)
     sensor_sigmas: dict[str, Array] = field(default_factory=dict)
+    stated_over_white: dict[str, float] = field(default_factory=dict)
     _moved: dict[tuple[str, tuple[int, ...]], list[tuple[Array, IntArray]]] = field(
         default_factory=dict
     )
@@ -113,8 +115,14 @@ def motion_evidence(
     drives = {n: t for n, t in enumerate(trajectories) if isinstance(t, SmoothedTrajectory)}
     motion = [_of_errors(t, structure.get(n)) for n, t in drives.items() if t.open_kinds]
     nothing = Observed(np.zeros(1), np.ones((1, 1)), np.ones(1), np.eye(1))
-    sigmas = _sensor_sigmas(list(drives.values()))
-    return Evidence(nothing, np.zeros((1, 6)), {}, motion=motion, sensor_sigmas=sigmas)
+    return Evidence(
+        nothing,
+        np.zeros((1, 6)),
+        {},
+        motion=motion,
+        sensor_sigmas=_sensor_sigmas(list(drives.values())),
+        stated_over_white=_stated_over_white(list(drives.values())),
+    )
 
 
 def _of_errors(
@@ -206,7 +214,7 @@ def linearised_evidence(
     observed = Observed(residuals, np.hstack([design, inputs]), ridge, known)
     # Of all drives, those in which nobody sees a target too.
     by_motion = motion_evidence(trajectories, structure)
-    return Evidence(observed, by_pose, white, effects, by_motion.motion, by_motion.sensor_sigmas)
+    return replace(by_motion, observed=observed, by_pose=by_pose, white=white, effects=effects)
 
 
 @dataclass(frozen=True)
@@ -240,6 +248,17 @@ def _sensor_sigmas(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, Arra
         for kind in trajectory.open_kinds:
             found.setdefault(kind, []).append(white_sigmas(trajectory.data, kind))
     return {kind: np.median(sigmas, axis=0) for kind, sigmas in found.items()}
+
+
+def _stated_over_white(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, float]:
+    """Sensor -> the largest ratio of what is stated to what is white, of its axes and drives."""
+    found: dict[str, float] = {}
+    for trajectory in trajectories:
+        for name, scale in trajectory.data.scales.items():
+            kind = name.partition("_")[0]
+            if kind in trajectory.open_kinds:
+                found[kind] = max(found.get(kind, 1.0), 1.0 / scale)
+    return found
 
 
 def _weak(problem: Problem, ranges: RangeErrors, key: int, size: int) -> Array:

@@ -22,7 +22,7 @@ NONE = 0.5
 SIZES = np.geomspace(0.1, 2.0, 6)
 """Of a correlated error, over the white sigma of the sensor: equally probable. The sigma that a
 driver states is meant for the whole error: one of twice as much shows itself, and a tenth does not
-matter."""
+matter. Where less than the stated sigma is white, what is left may be correlated (`sizes_of`)."""
 
 TIMES_S = np.geomspace(1.0, 100.0, 5)
 """Correlation times, equally probable: shorter ones are as good as white, longer ones constant over
@@ -50,6 +50,14 @@ class OpenError:
     expected: CorrelatedError
 
 
+def sizes_of(evidence: Evidence, kind: str) -> Array:
+    """`SIZES` of a sensor, up to twice what its driver states, in steps as large."""
+    left = evidence.stated_over_white.get(kind, 1.0)
+    step = SIZES[1] / SIZES[0]
+    more = math.ceil(math.log(max(left, 1.0)) / math.log(step) - 1e-9)
+    return np.append(SIZES, SIZES[-1] * step ** np.arange(1, more + 1))
+
+
 def of_expected_size(
     evidence: Evidence, parts: Sequence[Array], sigmas: Array, found: Sequence[CorrelatedError]
 ) -> tuple[CorrelatedError, ...]:
@@ -62,7 +70,9 @@ def of_expected_size(
     out = list(found)
     for i, error in enumerate(found):
         white = evidence.sensor_sigmas.get(error.kind)
-        if white is not None and (np.array(error.sigmas) <= SIZES[-1] * white).all():
+        if white is None:
+            continue
+        if (np.array(error.sigmas) <= sizes_of(evidence, error.kind)[-1] * white).all():
             others = [*out[:i], *out[i + 1 :]]
             out[i] = open_error(evidence, known, others, error.kind).expected
     return tuple(out)
@@ -107,31 +117,31 @@ def open_error(
     `known` are (N, N) covariances of all other errors of what the LiDARs see, but for those of
     `found`.
     """
-    white = evidence.sensor_sigmas[kind]
+    white, sizes = evidence.sensor_sigmas[kind], sizes_of(evidence, kind)
     others = [*known, *(_covariance(evidence, e.kind, np.array(e.sigmas), e.time_s) for e in found)]
     total = [np.sum(others, axis=0)] if others else []
     at_one = np.zeros(len(total))
     of_none = evidence.observed.value(total, at_one)
     motion = [of.given(found) for of in evidence.motion]
-    gain = np.zeros((len(SIZES), len(TIMES_S)))
+    gain = np.zeros((len(sizes), len(TIMES_S)))
     for j, time_s in enumerate(TIMES_S.tolist()):
         moved = _covariance(evidence, kind, white, time_s)
         seen = [
             evidence.observed.value([*total, moved], np.append(at_one, math.log(size)))
-            for size in SIZES.tolist()
+            for size in sizes.tolist()
         ]
         unit = _error(kind, white, time_s)
-        gain[:, j] = of_none - np.array(seen) + sum(of.gains(unit, SIZES) for of in motion)
-    return _summary(kind, white, gain)
+        gain[:, j] = of_none - np.array(seen) + sum(of.gains(unit, sizes) for of in motion)
+    return _summary(kind, white, sizes, gain)
 
 
-def _summary(kind: str, white: Array, gain: Array) -> OpenError:
+def _summary(kind: str, white: Array, sizes: Array, gain: Array) -> OpenError:
     """From the gain of log-likelihood by each size (rows) and time (columns) over no error."""
     highest = max(0.0, float(gain.max()))
     none = NONE * math.exp(-highest)
     weight = (1.0 - NONE) * np.exp(gain - highest) / gain.size
     total = none + weight.sum()
-    variance = weight * SIZES[:, None] ** 2 / total
+    variance = weight * sizes[:, None] ** 2 / total
     # Variance and slope at zero of the expected covariance.
     time_s = float(variance.sum() / (variance / TIMES_S).sum())
     expected = _error(kind, math.sqrt(variance.sum()) * white, time_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from caliv_graph.calibration.open_errors import (
     of_expected_size,
     open_error,
     open_errors,
+    sizes_of,
 )
 from caliv_graph.calibration.variance_components import Observed
 from caliv_graph.products import Array
@@ -142,3 +144,28 @@ def test_time_and_variance_are_those_of_the_expected_error() -> None:
 
     assert TIMES_S[0] < found.time_s < TIMES_S[-1]
     assert 0.0 < found.sigmas[0] < WHITE[0]
+
+
+def test_where_little_of_what_is_stated_is_white_the_rest_may_be_correlated() -> None:
+    """A receiver states 14 mm for its whole error: 4 of it are white, 12 correlated."""
+    rng = np.random.default_rng(5)
+    half = np.linalg.cholesky(correlated(10.0))
+    slow = 3.0 * WHITE[0] * rng.standard_normal((AXES, STEPS)) @ half.T
+    fixes = slow + WHITE[0] / math.sqrt(FIXES) * rng.standard_normal((AXES, STEPS))
+    silent = evidence(fixes)
+    stating = replace(silent, stated_over_white={"gnss": 3.6})
+
+    usual, wide = sizes_of(silent, "gnss"), sizes_of(stating, "gnss")
+    np.testing.assert_array_equal(usual, SIZES)
+    np.testing.assert_array_equal(wide[: len(SIZES)], SIZES)
+    assert 2.0 * 3.6 <= wide[-1] < 2.0 * 3.6 * SIZES[1] / SIZES[0]
+    assert wide[1:] / wide[:-1] == pytest.approx(SIZES[1] / SIZES[0])
+    # Less than is stated is never left: the steps stay.
+    np.testing.assert_array_equal(
+        sizes_of(replace(silent, stated_over_white={"gnss": 0.5}), "gnss"), SIZES
+    )
+
+    clipped = open_error(silent, [], [], "gnss").expected.sigmas[0]
+    found = open_error(stating, [], [], "gnss").expected.sigmas[0]
+    assert clipped <= 2.0 * WHITE[0] * (1.0 + 1e-9)
+    assert 2.2 * WHITE[0] < found < 5.0 * WHITE[0]

@@ -183,13 +183,13 @@ def _add_velocities(
         np.linalg.cholesky(R_twist_imu @ velocities.cov @ R_twist_imu.T), R_twist_imu
     )
     for k, i in enumerate(velocities.nodes.tolist()):
-        gained = np.array([0.0, 0.0, -data.gravity_m_s2 * velocities.delay_s[k]])
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(roots[k], False)
         factor = velocity_factor(
             key_imu(i),
             key_velocity(i),
             velocities.velocity_imu[k],
-            gained,
+            velocities.delay_s[k],
+            data.gravity_m_s2,
             noise,
             data.speed_scale,
         )

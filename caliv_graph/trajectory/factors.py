@@ -72,26 +72,32 @@ def velocity_factor(
     key_imu: int,
     key_velocity: int,
     velocity_imu: Array,
-    gained_map: Array,
+    delay_s: Array,
+    gravity_m_s2: float,
     noise: NoiseModel,
     scale: float = 1.0,
 ) -> gtsam.CustomFactor:
-    """A velocity of the IMU's origin, carried to the node: `r = k R^T (V + u) - z`, imu axes.
+    """Velocities of the IMU's origin, carried to the node: `r = k (R^T V + D R^T g) - z`, imu axes.
 
-    `velocity_imu` is z, (3,) m/s; `gained_map` is u, the velocity (3,) m/s that gravity adds until
-    the measurement; `noise` has the 3 dimensions of r; `scale` is k, measured over true velocity.
+    `velocity_imu` is z, (3,) m/s; `delay_s` is D, (3, 3) s, the mean time that gravity acts until
+    the measurements (`measurements.NodeVelocities`); `noise` has the 3 dimensions of r; `scale` is
+    k, measured over true velocity.
     """
+    gained = scale * gravity_m_s2 * delay_s
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         back = values.atPose3(key_imu).rotation().matrix().T
-        predicted = scale * (back @ (values.atVector(key_velocity) + gained_map))
+        moving, down = scale * (back @ values.atVector(key_velocity)), -back[:, 2]
         if jacobians is not None:
             # `skew`, written out: there is one such factor per message of the wheels.
-            x, y, z = predicted.tolist()
-            rows = ((0.0, -z, y, 0.0, 0.0, 0.0), (z, 0.0, -x, 0.0, 0.0, 0.0))
-            jacobians[0] = np.array((*rows, (-y, x, 0.0, 0.0, 0.0, 0.0)))
+            turned = []
+            for x, y, z in (moving.tolist(), down.tolist()):
+                turned.append(np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))))
+            out = np.zeros((3, 6))
+            out[:, :3] = turned[0] + gained @ turned[1]
+            jacobians[0] = out
             jacobians[1] = scale * back
-        return np.asarray(predicted - velocity_imu)
+        return np.asarray(moving + gained @ down - velocity_imu)
 
     return gtsam.CustomFactor(noise, [key_imu, key_velocity], error)
 
@@ -119,11 +125,14 @@ def velocity_residuals(
     gravity_m_s2: float,
     scale: float = 1.0,
 ) -> Array:
-    """(m, 3) residuals of `velocity_factor` of m velocities at their `nodes` (m,), all at once."""
-    velocity = states.velocity_map[nodes].copy()
-    velocity[:, 2] -= gravity_m_s2 * delay_s
-    seen = scale * np.einsum("mji,mj->mi", states.R_map_imu[nodes], velocity)
-    return np.asarray(seen - velocity_imu)
+    """(m, 3) residuals of `velocity_factor` of m velocities at their `nodes` (m,), all at once.
+
+    `delay_s` is (m, 3, 3).
+    """
+    R = states.R_map_imu[nodes]
+    seen = np.einsum("mji,mj->mi", R, states.velocity_map[nodes])
+    seen -= gravity_m_s2 * np.einsum("mij,mj->mi", delay_s, R[:, 2])
+    return np.asarray(scale * seen - velocity_imu)
 
 
 def biased_orientation_factor(

@@ -44,7 +44,8 @@ class NodeVelocities:
     Attributes:
         nodes: (m,) indices.
         velocity_imu: (m, 3) m/s in the IMU's axes at the node.
-        delay_s: (m,) mean time of the measurements after the node.
+        delay_s: (m, 3, 3) mean time of the measurements after the node, weighted as they are: where
+            each measures the forward velocity, along axes that turn, not the same in all axes.
         cov: (m, 3, 3) (m/s)^2, the same axes.
     """
 
@@ -211,10 +212,10 @@ def velocities_at_nodes(
     carried = np.einsum("nij,nj->ni", dR, at_imu) - scale * dv
     cov_node = rotated(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
     nodes, mean, mean_cov = _weighted_mean(node, carried, cov_node)
-    weight = 1.0 / np.trace(cov_node, axis1=1, axis2=2)
-    total = np.bincount(node, weight, len(nodes_ns))[nodes]
-    delay = np.bincount(node, weight * delay_s, len(nodes_ns))[nodes] / total
-    return NodeVelocities(nodes, mean, delay, mean_cov)
+    late = np.zeros((len(nodes), 3, 3))
+    weight = np.linalg.inv(cov_node) * delay_s[:, None, None]
+    np.add.at(late, np.searchsorted(nodes, node), weight)
+    return NodeVelocities(nodes, mean, np.asarray(mean_cov @ late), mean_cov)
 
 
 def positions_at_nodes(

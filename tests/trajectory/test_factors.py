@@ -63,12 +63,12 @@ def test_residuals_of_all_factors_at_once_are_theirs() -> None:
     nodes = np.zeros(2, dtype=np.int64)
 
     positions = position_residuals(states, nodes, measured, offset, np.array(delay_s), 9.8)
-    velocities = velocity_residuals(states, nodes, measured, np.array(delay_s), 9.8)
+    delays_s = np.array(delay_s)[:, None, None] * np.array([[1, 0.1, 0], [0, 0.9, 0], [0, 0, 1.1]])
+    velocities = velocity_residuals(states, nodes, measured, delays_s, 9.8)
 
     for k, late_s in enumerate(delay_s):
         of_fix = position_factor(POSE, VELOCITY, measured[k], offset[k], late_s, 9.8, UNIT)
-        gained = np.array([0.0, 0.0, -9.8 * late_s])
-        of_speed = velocity_factor(POSE, VELOCITY, measured[k], gained, UNIT)
+        of_speed = velocity_factor(POSE, VELOCITY, measured[k], delays_s[k], 9.8, UNIT)
         np.testing.assert_allclose(positions[k], of_fix.unwhitenedError(at), atol=1e-12)
         np.testing.assert_allclose(velocities[k], of_speed.unwhitenedError(at), atol=1e-12)
 
@@ -86,11 +86,15 @@ def test_position(delay_s: float) -> None:
 
 
 def test_velocity() -> None:
-    z, u = np.array([1.0, 0.2, 0.1]), np.array([0.0, 0.0, -0.3])
-    factor = velocity_factor(POSE, VELOCITY, z, u, UNIT)
+    z, late_s = (
+        np.array([1.0, 0.2, 0.1]),
+        np.array([[0.03, 0.01, 0], [0, -0.02, 0], [0.01, 0, 0.04]]),
+    )
+    factor = velocity_factor(POSE, VELOCITY, z, late_s, 9.8, UNIT)
     at = values()
     R = at.atPose3(POSE).rotation()
-    expected = R.unrotate(at.atVector(VELOCITY) + u) - z
+    g = np.array([0.0, 0.0, -9.8])
+    expected = R.unrotate(at.atVector(VELOCITY)) + late_s @ R.unrotate(g) - z
     np.testing.assert_allclose(factor.unwhitenedError(at), expected, atol=1e-12)
     check_jacobians(factor, at)
 
@@ -199,10 +203,10 @@ def test_what_leaves_a_common_turn_open_leaves_it_open_wherever_it_went() -> Non
 
 def test_a_scaled_velocity_has_the_right_jacobians() -> None:
     at = values()
-    factor = velocity_factor(POSE, VELOCITY, np.ones(3), np.array([0.1, 0.2, 0.3]), UNIT, 1.03)
+    factor = velocity_factor(POSE, VELOCITY, np.ones(3), 0.03 * np.eye(3), 9.8, UNIT, 1.03)
     check_jacobians(factor, at)
-    plain = velocity_factor(POSE, VELOCITY, np.zeros(3), np.zeros(3), UNIT)
-    scaled = velocity_factor(POSE, VELOCITY, np.zeros(3), np.zeros(3), UNIT, 1.03)
+    plain = velocity_factor(POSE, VELOCITY, np.zeros(3), 0.03 * np.eye(3), 9.8, UNIT)
+    scaled = velocity_factor(POSE, VELOCITY, np.zeros(3), 0.03 * np.eye(3), 9.8, UNIT, 1.03)
     np.testing.assert_allclose(scaled.unwhitenedError(at), 1.03 * plain.unwhitenedError(at))
 
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from caliv_graph.products import ImuSamples
+from caliv_graph.products import ImuSamples, TwistSamples
+from caliv_graph.trajectory.factors import velocity_residuals
 from caliv_graph.trajectory.imu import DeadReckoning
 from caliv_graph.trajectory.measurements import (
     NodeOrientations,
     nearest_node,
     orientations_at_nodes,
+    velocities_at_nodes,
 )
 from caliv_graph.trajectory.noise import imu_noise
+from caliv_graph.trajectory.states import States
 from tests.trajectory.motions import START_NS, Sensors, config_for
 
 SAMPLES = 400
@@ -62,3 +66,26 @@ def test_orientations_in_parts_are_those_of_the_whole(
     # And they are orientations: the turn from the first node to the last.
     turn = Rotation.from_matrix(whole.R_map_imu[0].T @ whole.R_map_imu[-1]).as_rotvec()
     assert turn[2] == pytest.approx(0.2 * 3.9, abs=2e-3)
+
+
+def test_forward_velocities_of_a_pitching_vehicle_agree_with_its_motion() -> None:
+    """Gravity adds to each until the node, along axes that turn: 5 mm/s at half a rad/s."""
+    rate, speed = 0.5, 3.0
+    at = 10**12 + 2_000_000 * np.arange(1001)
+    seconds = (at - at[0]) * 1e-9
+    gyro = np.tile([0.0, rate, 0.0], (len(at), 1))
+    turned = np.array([gtsam.Rot3.Ry(rate * s).matrix() for s in seconds])
+    force = np.array([0.0, 0.0, -rate * speed]) + 9.8 * turned[:, 2]
+    dead = DeadReckoning(at, gyro, force)
+    nodes = at[0] + 100_000_000 * np.arange(1, 19)
+    odometry = TwistSamples(at[25:-25:5], np.tile([speed, 0.0, 0.0], (len(at[25:-25:5]), 1)))
+    cov = np.tile(np.diag([0.03**2, 10.0**2, 10.0**2]), (len(odometry.stamps_ns), 1, 1))
+    samples = ImuSamples(at, gyro, force)
+    noise = imu_noise(samples, config_for(Sensors()))
+    found = velocities_at_nodes(odometry, cov, nodes, dead, noise, gtsam.Pose3())
+    assert found is not None
+    R = np.array([gtsam.Rot3.Ry(rate * s).matrix() for s in (nodes - at[0]) * 1e-9])
+    none = np.zeros((len(nodes), 3))
+    states = States(R, none, R[:, :, 0] * speed, none, none)
+    residuals = velocity_residuals(states, found.nodes, found.velocity_imu, found.delay_s, 9.8)
+    assert np.abs(residuals[:, 0]).max() < 5e-4

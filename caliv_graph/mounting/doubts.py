@@ -90,7 +90,11 @@ def doubts(
         RecordingError: a cloud could not be read.
     """
     found: dict[tuple[object, ...], Doubt] = {}
-    names = [n for n, lidar in config.lidars.items() if _is_guessed(lidar)]
+    names = [
+        name
+        for name, lidar in config.lidars.items()
+        if lidar.initial is not None and not isinstance(lidar, FoundLidarConfig)
+    ]
     for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
         given = isinstance(trajectory, GivenTrajectory)
         if isinstance(trajectory, GivenTrajectory) and trajectory.odometry is not None:
@@ -101,11 +105,6 @@ def doubts(
             of = () if doubt.kind in ("exchanged", "turned") else (drive,)
             found.setdefault((doubt.kind, doubt.lidars, *of), doubt)
     return tuple(found.values())
-
-
-def _is_guessed(lidar: object) -> bool:
-    """Whether somebody gave the guess of a LiDAR."""
-    return getattr(lidar, "initial", None) is not None and not isinstance(lidar, FoundLidarConfig)
 
 
 def _views(

@@ -29,7 +29,6 @@ from caliv_graph.structure.problem import (
     layout_of,
     placed_patches,
     placed_sightings,
-    with_hold,
 )
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.rows import PLACE_PRIOR_M, TILT_PRIOR_RAD, Rows, whitened
@@ -178,10 +177,9 @@ def _on(state: State, strips: Strips, layout: Layout) -> State:
 def at_the_solve(other: OtherStrips) -> Measured:
     """At the estimate of the solve, with its covariance."""
     used = other.used
-    H, _ = with_hold(used.problem, used.state, used.system)
-    factor = factor_of(H)
+    factor = used.factor
     rng = np.random.default_rng(0)
-    draws = _draws(factor, rng.standard_normal((len(H), DRAWS)))
+    draws = _draws(factor, rng.standard_normal((len(factor[0]), DRAWS)))
     return _measured(other, used.state, lambda D: D @ solved(factor, D.T), draws, rng)
 
 
@@ -242,8 +240,7 @@ def at_extrinsics_on_the_poses(
     these are wrong. The errors of the solve and of the given extrinsics are taken as independent.
     """
     layout, used = other.layout, other.used
-    H, _ = with_hold(used.problem, used.state, used.system)
-    factor = factor_of(H)
+    factor = used.factor
     given = np.arange(layout.offset, layout.error)
     rest = np.setdiff1d(np.arange(layout.plane), given)
 

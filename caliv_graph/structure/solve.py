@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
@@ -31,6 +31,7 @@ from caliv_graph.structure.problem import (
     layout_of,
     placed_patches,
     placed_sightings,
+    with_hold,
 )
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.rows import whitened
@@ -115,6 +116,12 @@ class Solved(Estimate):
 
     system: System
     clocks: Clocks = field(default_factory=dict)
+
+    @cached_property
+    def factor(self) -> tuple[Array, Array]:
+        """Of its information with what holds the extrinsics (`elimination.factor_of`)."""
+        H, _ = with_hold(self.problem, self.state, self.system)
+        return factor_of(H)
 
 
 @dataclass(frozen=True)

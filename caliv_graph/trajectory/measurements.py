@@ -88,15 +88,15 @@ def rotated(R: Array, cov: Array) -> Array:
 
 
 def _weighted_mean(group: IntArray, values: Array, cov: Array) -> tuple[IntArray, Array, Array]:
-    """Groups (g,); means (g, 3) of (m, 3) values weighted by `cov` (m, 3, 3); their covariances."""
+    """Groups (g,); means (g, 3, c) of (m, 3, c) vectors, weighted by `cov` (m, 3, 3); their cov."""
     groups, at = np.unique(group, return_inverse=True)
     weight = np.linalg.inv(cov)
     information = np.zeros((len(groups), 3, 3))
     np.add.at(information, at, weight)
-    moment = np.zeros((len(groups), 3))
-    np.add.at(moment, at, np.einsum("nij,nj->ni", weight, values))
+    moment = np.zeros((len(groups), *values.shape[1:]))
+    np.add.at(moment, at, np.einsum("nij,njc->nic", weight, values))
     mean_cov = np.linalg.inv(information)
-    return np.asarray(groups), np.einsum("nij,nj->ni", mean_cov, moment), np.asarray(mean_cov)
+    return np.asarray(groups), np.einsum("nij,njc->nic", mean_cov, moment), np.asarray(mean_cov)
 
 
 def orientations_at_nodes(
@@ -151,8 +151,8 @@ def _oriented(
     reference[node[order][first]] = order[first]
     R_reference = R_node[reference[node]]
     differences = log_so3(np.swapaxes(R_reference, 1, 2) @ R_node)
-    nodes, mean, mean_cov = _weighted_mean(node, differences, cov_node)
-    return nodes, R_node[reference[nodes]] @ exp_so3(mean), mean_cov
+    nodes, mean, mean_cov = _weighted_mean(node, differences[:, :, None], cov_node)
+    return nodes, R_node[reference[nodes]] @ exp_so3(mean[:, :, 0]), mean_cov
 
 
 def usable_orientations(imu: ImuSamples) -> BoolArray:
@@ -211,11 +211,9 @@ def velocities_at_nodes(
     delay_s = (stamps - at_node) * 1e-9
     carried = np.einsum("nij,nj->ni", dR, at_imu) - scale * dv
     cov_node = rotated(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
-    nodes, mean, mean_cov = _weighted_mean(node, carried, cov_node)
-    late = np.zeros((len(nodes), 3, 3))
-    weight = np.linalg.inv(cov_node) * delay_s[:, None, None]
-    np.add.at(late, np.searchsorted(nodes, node), weight)
-    return NodeVelocities(nodes, mean, np.asarray(mean_cov @ late), mean_cov)
+    late = delay_s[:, None, None] * np.eye(3)
+    nodes, mean, mean_cov = _weighted_mean(node, np.dstack([carried[:, :, None], late]), cov_node)
+    return NodeVelocities(nodes, mean[:, :, 0], mean[:, :, 1:], mean_cov)
 
 
 def positions_at_nodes(

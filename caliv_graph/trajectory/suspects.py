@@ -122,13 +122,12 @@ def misfit(smoothed: SmoothedTrajectory) -> float:
     outliers do not matter, and a single wrong input is small in most of them.
     """
     squares: dict[str, list[float]] = {kind: [] for kind in ("gnss", "velocity", "orientation")}
-    estimate = smoothed.estimate()
+    estimate = smoothed.estimate(squares.keys())
     for number, kind in enumerate(estimate.graph.kinds):
-        if kind in squares:
-            factor: Any = estimate.graph.factors.at(number)
-            residual = factor.unwhitenedError(estimate.values)
-            white = factor.noiseModel().unweightedWhiten(residual)
-            squares[kind].append(float(white @ white))
+        factor: Any = estimate.graph.factors.at(number)
+        residual = factor.unwhitenedError(estimate.values)
+        white = factor.noiseModel().unweightedWhiten(residual)
+        squares[kind].append(float(white @ white))
     usual = float(chdtri(3, 0.5))
     return max([1.0, *(float(np.median(some)) / usual for some in squares.values() if some)])
 

@@ -28,8 +28,7 @@ from caliv_graph.products import (
     Recording,
     Trajectory,
 )
-from caliv_graph.structure.elimination import covariance_of, factor_of
-from caliv_graph.structure.problem import with_hold
+from caliv_graph.structure.elimination import covariance_of
 from caliv_graph.structure.solve import Solved
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
@@ -190,8 +189,7 @@ def _pose_covariance(used: Solved, taken_ns: IntArray) -> Array:
     own = used.problem.prior.stamps_ns
     after = np.clip(np.searchsorted(own, taken_ns), 1, len(own) - 1)
     at = after - (taken_ns - own[after - 1] < own[after] - taken_ns)
-    H, _ = with_hold(used.problem, used.state, used.system)
     poses, inverse = np.unique(at, return_inverse=True)
-    cov = covariance_of(factor_of(H), (6 * poses[:, None] + np.arange(6)).ravel())
+    cov = covariance_of(used.factor, (6 * poses[:, None] + np.arange(6)).ravel())
     rows = (6 * inverse.ravel()[:, None] + np.arange(6)).ravel()
     return np.asarray(0.5 * (cov + cov.T)[np.ix_(rows, rows)])

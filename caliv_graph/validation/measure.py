@@ -201,13 +201,13 @@ class SurfaceMeter:
         points = self._clouds.points_map(placed, poses)[self._surface.members]
         beams = self._clouds.beams_map(placed, poses)[self._surface.members]
         merged = _refitted(points, beams, self._surface)
-        residual, normal, _ = linearised(merged.surface, points)
-        variance = (sigma_range_m * np.einsum("ni,ni->n", beams, normal)) ** 2
+        assert isinstance(merged.surface, Wall)
+        variance = (sigma_range_m * (beams @ merged.surface.normal)) ** 2
         cell, count = self._cells(points)
         told = count >= RELIEF_POINTS
         if told.sum() < RELIEF_CELLS:
             return 0.0
-        mean = np.bincount(cell, residual)[told] / count[told]
+        mean = np.bincount(cell, merged.residual)[told] / count[told]
         of_noise = np.bincount(cell, variance)[told] / count[told] ** 2
         freedom = (told.sum() - 3) / told.sum()
         return float(np.sqrt(max(np.mean(mean**2) / freedom - np.mean(of_noise), 0.0)))

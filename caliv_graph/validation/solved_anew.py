@@ -15,8 +15,7 @@ from scipy.special import chdtrc
 from caliv_graph.geometry.covariance import relative_jacobian
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, right_to_vehicle_axes
 from caliv_graph.products import Array
-from caliv_graph.structure.elimination import factor_of, solved
-from caliv_graph.structure.problem import with_hold
+from caliv_graph.structure.elimination import covariance_of
 from caliv_graph.structure.solve import Solved
 from caliv_graph.uncertainty.pairs import sensor_pairs
 from caliv_graph.validation.clouds import Extrinsics
@@ -42,9 +41,7 @@ def pair_tests(
     names = used.problem.patches.lidars
     T_solved = used.state.T_vehicle_lidar
     own = np.arange(used.layout.extrinsic, used.layout.error)
-    H, _ = with_hold(used.problem, used.state, used.system)
-    columns = np.eye(len(H))[:, own]
-    cov_solved = solved(factor_of(H), columns)[own]
+    cov_solved = covariance_of(used.factor, own)
     axes = joint_right_to_vehicle_axes(T_solved)
     guessed = axes.T @ np.linalg.inv(used.problem.held_information) @ axes
     out = []

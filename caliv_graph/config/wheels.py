@@ -41,7 +41,7 @@ class WheelsConfig(Section):
     speed_scale_sigma: NonNegative | None = Field(
         None,
         description="1 sigma of the scale of the speeds, measured over true, less one; absent: "
-        "0.02 without an IMU, exact with one; 0: exact",
+        "0.02, exact beside an IMU where lateral velocities are measured, too; 0: exact",
     )
 
     def rotation_sigmas_rad(self) -> tuple[float, float, float]:
@@ -50,8 +50,8 @@ class WheelsConfig(Section):
         x, y, z = deg if isinstance(deg, tuple) else (deg,) * 3
         return math.radians(x), math.radians(y), math.radians(z)
 
-    def scale_sigma(self, with_imu: bool) -> float | None:
+    def scale_sigma(self, of_wheels: bool) -> float | None:
         """Sigma of the scale of the speeds; None: it is exact."""
         if self.speed_scale_sigma is None:
-            return None if with_imu else SPEED_SCALE_SIGMA
+            return SPEED_SCALE_SIGMA if of_wheels else None
         return self.speed_scale_sigma or None

@@ -196,7 +196,7 @@ class _Residuals:
         carried = carry_to_nodes(moved, self._nodes, self._dead_of(moved), kinds).velocities
         if carried is None:
             return np.zeros((0, 3))
-        return velocity_residuals(
+        r = velocity_residuals(
             self._at,
             carried.nodes,
             carried.velocity_imu,
@@ -204,3 +204,11 @@ class _Residuals:
             moved.gravity_m_s2,
             moved.speed_scale,
         )
+        # The axes in which they are measured turn with the mounting of the IMU, the roots do not.
+        # Lateral parts of several forward velocities around a node are noise, of metres per second:
+        # turned into the forward part, they would tell the mounting.
+        then, now = (
+            of.T_vehicle_twist.between(of.T_vehicle_imu).rotation().matrix()
+            for of in (self._data, moved)
+        )
+        return np.asarray(r @ (then.T @ now).T)

@@ -24,6 +24,7 @@ from caliv_graph.trajectory.noise import (
 )
 from caliv_graph.trajectory.wheels import (
     WheelModel,
+    is_planar,
     scaled_wheel_noise,
     wheel_model,
     wheel_noise,
@@ -62,6 +63,8 @@ class SmootherInput:
             frame, `inertial` and `noise` are of `wheels.wheel_samples`, and gravity is zero.
         slope: (2,) of the mean ground along the map's x and y, where there is no IMU.
         speed_scale: measured over true velocities.
+        speed_point: (2,) y and z in the vehicle frame, metres, of where wheels beside an IMU
+            measure the speed.
         headings: directions of a baseline as angles; None: there are none.
         baselines: the same as vectors between two antennas.
         heading_yaw: direction of that baseline in the vehicle frame, to the left of x, radians.
@@ -83,6 +86,7 @@ class SmootherInput:
     wheels: WheelModel | None = None
     slope: Array = field(default_factory=lambda: np.zeros(2))
     speed_scale: float = 1.0
+    speed_point: Array = field(default_factory=lambda: np.zeros(2))
     headings: Headings | None = None
     baselines: Baselines | None = None
     heading_yaw: float = 0.0
@@ -104,7 +108,20 @@ class SmootherInput:
     def T_vehicle_twist(self) -> gtsam.Pose3:
         """The frame in which velocities are measured."""
         planar = self.wheels is not None and self.wheels.planar
-        return self.T_vehicle_imu if planar else gtsam.Pose3()
+        if planar:
+            return self.T_vehicle_imu
+        return gtsam.Pose3(gtsam.Rot3(), np.append(0.0, self.speed_point))
+
+    @property
+    def speed_alone(self) -> bool:
+        """Whether wheels beside an IMU measure the forward velocity alone."""
+        twist = self.motion.twist
+        return self.wheels is None and twist is not None and is_planar(twist)
+
+    @property
+    def speed_scale_sigma(self) -> float | None:
+        """Of the scale of the velocities; None: it is exact."""
+        return self.config.wheels.scale_sigma(self.speed_alone or self.wheels is not None)
 
     @property
     def arm_imu(self) -> Array:

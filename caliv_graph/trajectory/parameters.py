@@ -104,6 +104,10 @@ def _scale_moved(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, speed_scale=scale, noise=noise)
 
 
+def _speed_point_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, speed_point=data.speed_point + d)
+
+
 def _heading_moved(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, heading_yaw=data.heading_yaw + float(d[0]))
 
@@ -141,6 +145,11 @@ WHEEL_SCALE = replace(SPEED_SCALE, kinds=frozenset({"velocity", "imu"}))
 """The same without an IMU. The prior of the motion is then one of what the wheels measure: walks of
 the acceleration are in their unit. In metres it would prefer a vehicle that moves less, and with it
 a larger scale (`README.md`, section 15)."""
+
+SPEED_POINT = InputParameter(
+    "twist.point", ("y", "z"), "m", np.full(2, 0.01), frozenset({"velocity"}), _speed_point_moved
+)
+"""Where in the vehicle frame wheels measure the speed, beside an IMU (`README.md`, section 15)."""
 
 
 HEADING_YAW = InputParameter(

@@ -27,6 +27,7 @@ from caliv_graph.trajectory.parameters import (
     LEVER_ARM,
     SECOND_ARM,
     SLOPE,
+    SPEED_POINT,
     SPEED_SCALE,
     WHEELS_ROTATION,
     UncertainParameter,
@@ -42,6 +43,11 @@ the weights of Huber's kernel."""
 STEP_SIGMAS, ROUGH_STEP_SIGMAS = 0.01, 0.1
 """Step of a parameter, in sigmas of what is then known of it, at which it has converged; while
 outliers are still in the graph."""
+
+SPEED_POINT_SIGMAS = (0.1, 0.5)
+"""1 sigma of it, metres, beside the vehicle's x axis. The body pitches about a point half a metre
+above the axle on which the wheels roll; wheels of one side, or of other radii, measure a part of
+the turn."""
 
 WIDE_SIGMAS = {
     LEVER_ARM.name: 0.05,
@@ -86,9 +92,11 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
     if data.wheels is not None:
         slope = np.full(2, np.radians(wheels.slope_sigma_deg))
         out.append(UncertainParameter(SLOPE, slope, np.zeros(2)))
-    scale = wheels.scale_sigma(with_imu=data.wheels is None)
+    scale = data.speed_scale_sigma
     if scale is not None and data.motion.twist is not None:
         out.append(UncertainParameter(speed_scale(data), np.full(1, scale), np.zeros(1)))
+    if data.speed_alone:
+        out.append(UncertainParameter(SPEED_POINT, np.array(SPEED_POINT_SIGMAS), np.zeros(2)))
     heading = data.config.heading
     if data.headings is not None:
         sigma = np.full(1, np.radians(heading.sigma_deg))

@@ -36,6 +36,7 @@ from caliv_graph.trajectory.parameters import (
     HEADING_YAW,
     LEVER_ARM,
     SECOND_ARM,
+    SPEED_POINT,
     mount_rotation,
     speed_scale,
 )
@@ -132,8 +133,9 @@ def estimated_scales(
     # Free, whatever sigma they have: a lever arm that was typed wrong is no noise.
     rotation = mount_rotation(data)
     typed = [rotation] if data.positions is None else [LEVER_ARM, rotation]
-    if data.motion.twist is not None and data.config.wheels.scale_sigma(data.wheels is None):
+    if data.motion.twist is not None and data.speed_scale_sigma:
         typed.append(speed_scale(data))
+    typed += [SPEED_POINT] if data.speed_alone else []
     typed += [HEADING_YAW] if data.headings is not None else []
     typed += [SECOND_ARM] if data.baselines is not None else []
     columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)

@@ -101,18 +101,43 @@ def test_the_scale_of_the_wheels_is_found() -> None:
     assert abs(found.data.speed_scale - SCALE) < 4.0 * sigmas[0]
 
 
-def test_with_an_imu_the_scale_is_found_if_it_is_asked_for() -> None:
-    motion, inertial = wheels(3), record(DRIVE, ANTENNA, 3)
-    motion = replace(motion, imu=inertial.imu)
+def beside_imu(seed: int, point_m: float = 0.0) -> MotionData:
+    """The same beside an IMU; the speed is that of a point to the left of the vehicle's x axis."""
+    motion, inertial = wheels(seed), record(DRIVE, ANTENNA, seed)
+    assert motion.twist is not None
+    turn = DRIVE.at(seconds(motion.twist.stamps_ns)).rates[:, 2]
+    velocity = motion.twist.velocity.copy()
+    velocity[:, 0] -= SCALE * point_m * turn
+    return replace(motion, imu=inertial.imu, twist=replace(motion.twist, velocity=velocity))
+
+
+def test_with_an_imu_scale_and_place_of_the_speed_are_found() -> None:
+    motion = beside_imu(3, point_m=0.08)
     wanted = stamps(DRIVE.duration_s, 2.0)
-    found = smooth_trajectory(motion, settings(speed_scale_sigma=0.02), wanted)
-    sigmas = found.sigmas_of("twist.scale")
+    found = smooth_trajectory(motion, settings(), wanted)
+    sigmas, point = found.sigmas_of("twist.scale"), found.sigmas_of("twist.point")
     assert sigmas is not None
     assert sigmas[0] < 2e-3
     assert abs(found.data.speed_scale - SCALE) < 4.0 * sigmas[0]
-    exact = smooth_trajectory(motion, settings(), wanted)
+    assert point is not None
+    assert point[0] < 0.02
+    assert abs(found.data.speed_point[0] - 0.08) < 4.0 * point[0]
+    exact = smooth_trajectory(beside_imu(3), settings(speed_scale_sigma=0), wanted)
     assert exact.data.speed_scale == 1.0
     assert exact.sigmas_of("twist.scale") is None
+
+
+def test_forward_speeds_do_not_tell_how_an_imu_is_turned() -> None:
+    """On level ground, from an axle that does not slip: what they would tell is their noise."""
+    motion = beside_imu(4)
+    config = settings().model_copy(deep=True)
+    imu = config.imu.model_copy(update={"rotation_sigma_deg": 0.3})
+    found = smooth_trajectory(
+        motion, config.model_copy(update={"imu": imu}), stamps(DRIVE.duration_s, 2.0)
+    )
+    sigmas = found.sigmas_of("imu.T_vehicle_imu")
+    assert sigmas is not None
+    assert sigmas[1:] == pytest.approx(np.radians([0.3, 0.3]), rel=0.1)
 
 
 @pytest.mark.parametrize("hz", [1, 2])

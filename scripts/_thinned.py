@@ -435,6 +435,7 @@ class ThinnedRecording(SimulatedRecording):
                 None,
                 random_stream(self.seed, Stream.LIDAR, index),
                 self.truth.range_bias_m[name],
+                self.channel_errors.get(name),
             )
             for index, (name, model) in enumerate(self.scenario.lidars.items())
         }

@@ -123,6 +123,16 @@ class LidarModel(Section):
         0.0,
         description="metres, 1 sigma of a constant error that is drawn once per drive and added",
     )
+    channel_bias_sigma_m: NonNegative = Field(
+        0.0,
+        description="metres, 1 sigma of an error of the ranges of each channel, drawn once per "
+        "drive and added",
+    )
+    channel_direction_sigma_mrad: NonNegative = Field(
+        0.0,
+        description="milliradians, 1 sigma of the errors of elevation and azimuth of each "
+        "channel, drawn once per drive",
+    )
     incidence_bias_m: Finite = Field(
         0.0,
         description="metres, error b (1 / cos(incidence) - 1) of a range: b at 60 degrees, "

@@ -77,6 +77,21 @@ def column_times(model: LidarModel, columns: int) -> Array:
 
 
 @dataclass(frozen=True)
+class ChannelErrors:
+    """What the channels of a LiDAR get wrong, the same in every scan; (channels,) each.
+
+    Attributes:
+        range_m: reported less true ranges.
+        elevation_rad: true less reported elevations.
+        azimuth_rad: true less reported azimuths.
+    """
+
+    range_m: Array
+    elevation_rad: Array
+    azimuth_rad: Array
+
+
+@dataclass(frozen=True)
 class LidarReturns:
     """The returns of one scan.
 
@@ -110,8 +125,12 @@ class SimulatedLidar:
         crop: CropModel | None,
         rng: np.random.Generator,
         range_bias_m: float = 0.0,
+        channel_errors: ChannelErrors | None = None,
     ) -> None:
-        """`range_bias_m` is the error of all ranges on this drive; the model's is not added."""
+        """`range_bias_m` is the error of all ranges on this drive; the model's is not added.
+
+        `channel_errors` are those of this drive; None: channels have none.
+        """
         self.T_vehicle_lidar = model.mounting.pose()
         self._model = model
         self._caster = caster
@@ -122,7 +141,12 @@ class SimulatedLidar:
         directions = beam_directions(model)
         self.channels, self.columns = directions.shape[:2]
         self.column_times_s = column_times(model, self.columns)
-        self._directions_lidar = directions.reshape(-1, 3)
+        reported = directions.reshape(-1, 3)
+        true = reported if channel_errors is None else _turned_channels(directions, channel_errors)
+        self._directions_lidar, self._reported_lidar = true, reported
+        self._beam_bias_m = np.zeros(len(reported))
+        if channel_errors is not None:
+            self._beam_bias_m = np.repeat(channel_errors.range_m, self.columns)
         self._spheres_map: list[tuple[Array, float]] = []
         always = np.full(directions.shape[:2], crop is None)
         if crop is not None:
@@ -269,11 +293,11 @@ class SimulatedLidar:
         objects[on_vehicle] = self._vehicle_index
         # The body of the vehicle is hit squarely.
         cosine = np.where(on_vehicle, 1.0, _cosine(directions_map, normals_map))
-        measured_m = distance_m + noise_m + self._bias_m(cosine)
+        measured_m = distance_m + noise_m + self._bias_m(cosine) + self._beam_bias_m[beams]
         # Infinite where nothing was hit.
         reported = (measured_m >= self._model.min_range_m) & (measured_m <= self._model.max_range_m)
         return LidarReturns(
-            points_lidar=directions_lidar[reported] * measured_m[reported, None],
+            points_lidar=self._reported_lidar[beams[reported]] * measured_m[reported, None],
             objects=objects[reported],
             beams=beams[reported],
         )
@@ -290,6 +314,14 @@ class SimulatedLidar:
     def _draw_edges(self) -> tuple[SingleArray, SingleArray]:
         """(beams, 2) normal and (beams, 3) uniform draws."""
         return _edge_draws(self._edge_rng, len(self._directions_lidar))
+
+
+def _turned_channels(directions: Array, errors: ChannelErrors) -> Array:
+    """(channels columns, 3) true directions of beams from reported ones (channels, columns, 3)."""
+    x, y, z = np.moveaxis(directions, 2, 0)
+    elevation = np.arctan2(z, np.hypot(x, y)) + errors.elevation_rad[:, None]
+    azimuth = np.arctan2(y, x) + errors.azimuth_rad[:, None]
+    return unit_vectors(elevation, azimuth).reshape(-1, 3)
 
 
 def _cosine(directions: Array, normals: Array) -> Array:

@@ -17,8 +17,10 @@ from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import ConfigError
 from caliv_graph.products import Array, IntArray
+from caliv_graph.scenario.beams import channel_elevations_deg
 from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
 from caliv_graph.scenario.sensor_models import LidarModel, PoseNoiseModel
+from caliv_graph.simulation.lidar import ChannelErrors
 
 
 class Stream(enum.IntEnum):
@@ -40,6 +42,7 @@ class Stream(enum.IntEnum):
     ORIENTATION_CORRELATED = 13
     RANGE_BIAS = 14
     TIME_JITTER = 15
+    CHANNELS = 16
 
 
 def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator:
@@ -69,6 +72,17 @@ def height_and_heave(
 def drawn_range_bias_m(model: LidarModel, rng: np.random.Generator) -> float:
     """The constant error of all ranges of a LiDAR on one drive, in metres."""
     return model.range_bias_m + model.range_bias_sigma_m * float(rng.standard_normal())
+
+
+def drawn_channel_errors(model: LidarModel, rng: np.random.Generator) -> ChannelErrors:
+    """The errors of the channels of a LiDAR on one drive."""
+    draws = rng.standard_normal((3, len(channel_elevations_deg(model))))
+    turned = 1e-3 * model.channel_direction_sigma_mrad
+    return ChannelErrors(
+        range_m=model.channel_bias_sigma_m * draws[0],
+        elevation_rad=turned * draws[1],
+        azimuth_rad=turned * draws[2],
+    )
 
 
 def gauss_markov(stamps_ns: IntArray, correlation_s: float, rng: np.random.Generator) -> Array:

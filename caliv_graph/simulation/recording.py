@@ -28,6 +28,7 @@ from caliv_graph.simulation.motion import (
 )
 from caliv_graph.simulation.noise import (
     Stream,
+    drawn_channel_errors,
     drawn_range_bias_m,
     height_and_heave,
     perturbed_extrinsic,
@@ -101,6 +102,7 @@ class SimulatedRecording:
     Attributes:
         seed: seed of all draws.
         guesses: initial guess of T_vehicle_lidar per LiDAR.
+        channel_errors: of the LiDARs whose channels have any.
     """
 
     def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
@@ -138,6 +140,11 @@ class SimulatedRecording:
                 for index, (name, model) in enumerate(scenario.lidars.items())
             },
         )
+        self.channel_errors = {
+            name: drawn_channel_errors(model, random_stream(seed, Stream.CHANNELS, index))
+            for index, (name, model) in enumerate(scenario.lidars.items())
+            if model.channel_bias_sigma_m or model.channel_direction_sigma_mrad
+        }
         self.guesses: dict[str, PoseConfig] = {
             name: perturbed_extrinsic(
                 model.mounting,
@@ -234,6 +241,7 @@ class SimulatedRecording:
             self.scenario.crop,
             random_stream(self.seed, Stream.LIDAR, index),
             self.truth.range_bias_m[lidar],
+            self.channel_errors.get(lidar),
         )
         for frame, stamp_ns in enumerate(self._frame_stamps(lidar).tolist()):
             absolute_ns = stamp_ns + self.truth.start_ns

@@ -14,7 +14,7 @@ from caliv_graph.scenario.model import Scenario
 from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.world import make_world
 from caliv_graph.scenario.world_models import BodyBoxModel, GroundModel, WorldModel
-from caliv_graph.simulation.lidar import SimulatedLidar
+from caliv_graph.simulation.lidar import ChannelErrors, SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.simulation.recording import simulate_drive
 
@@ -59,6 +59,28 @@ def test_the_vehicle_itself_is_hit_squarely() -> None:
     body = (BodyBoxModel(centre_m=(20.0, 0.0, 0.5), size_m=(60.0, 60.0, 0.1)),)
     model = LIDAR.model_copy(update={"incidence_bias_m": 0.002})
     np.testing.assert_array_equal(ranges(model, body=body), ranges(LIDAR, body=body))
+
+
+def test_each_channel_has_its_own_error_of_range_and_direction() -> None:
+    world = make_world(WorldModel(), ())
+    errors = ChannelErrors(
+        range_m=np.array([0.01, 0.0, 0.0, 0.0, 0.0]),
+        elevation_rad=np.array([0.0, 1e-3, 0.0, 0.0, 0.0]),
+        azimuth_rad=np.array([0.0, 0.0, 2e-3, 0.0, 0.0]),
+    )
+    rng = np.random.default_rng(1)
+    lidar = SimulatedLidar(LIDAR, world, RayCaster(world), None, rng, 0.0, errors)
+    points = lidar.scan(gtsam.Pose3()).points_lidar.reshape(5, 2, 3)
+    measured_m = np.linalg.norm(points, axis=2)
+    difference_m = measured_m - ranges(LIDAR)
+    np.testing.assert_allclose(difference_m[0], 0.01, atol=1e-6)
+    # A beam that is higher than reported goes farther: 2 m over the sine of 45 degrees.
+    farther_m = 2.0 / math.sin(math.radians(45.0) - 1e-3) - 2.0 / math.sin(math.radians(45.0))
+    np.testing.assert_allclose(difference_m[1], farther_m, atol=1e-6)
+    # On level ground the azimuth changes no range; reported directions are those of the model.
+    np.testing.assert_allclose(difference_m[2:], 0.0, atol=1e-6)
+    elevations = np.degrees(np.arcsin(points[:, 0, 2] / measured_m[:, 0]))
+    assert elevations.tolist() == pytest.approx(LIDAR.elevations_deg)
 
 
 def biased_scenario(**changes: float) -> Scenario:

@@ -102,7 +102,7 @@ def _calibrate(
             calibration,
             solution,
             recordings,
-            prepared.trajectories,
+            trajectories,
             motions,
             prepared.config,
             displaced=bool(prepared.contradictions),

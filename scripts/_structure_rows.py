@@ -56,6 +56,7 @@ class Row:
         chair: whether the chair is a target.
         runs: default number of runs.
         limits: of the RMSE per kind of quantity (S2S, S2V): x y z in mm, roll pitch yaw in mrad.
+        channels: whether each channel has a range and a direction of its own.
         must_fail: whether there must be no result: exit code 2 or 3.
     """
 
@@ -66,6 +67,7 @@ class Row:
     chair: bool = False
     runs: int = 20
     limits: Mapping[str, SIX] = field(default_factory=dict)
+    channels: bool = False
     must_fail: bool = False
 
 
@@ -124,6 +126,11 @@ ROWS: Mapping[str, Row] = {
         lidars="shared",
         limits={"S2S": (3.0, 3.0, 1.0, 0.3, 0.3, 0.3)},
     ),
+    "yard_channels": Row(
+        "yard, figure-eight, walls and ground, channels off by 4 mm and 0.2 mrad each",
+        "yard",
+        channels=True,
+    ),
     "street": Row("street, parallel fronts and one crossing", "street"),
     "car_park": Row("car park, rows of cars and few walls", "car_park"),
     "field": Row("field, hedges only: no result", "field", must_fail=True),
@@ -151,7 +158,15 @@ def scenario_of(row: str) -> Scenario:
     if asked.lidars != "two":
         changes["lidars"] = _lidars(asked.lidars, base.lidars["front"])
         changes["reference"] = "front"
-    return base.model_copy(update={**changes, "world": world})
+    scenario = base.model_copy(update={**changes, "world": world})
+    return _with_channel_errors(scenario) if asked.channels else scenario
+
+
+def _with_channel_errors(scenario: Scenario) -> Scenario:
+    """LiDARs whose channels are calibrated as well as those of a good one."""
+    errors = {"channel_bias_sigma_m": 0.004, "channel_direction_sigma_mrad": 0.2}
+    lidars = {name: lidar.model_copy(update=errors) for name, lidar in scenario.lidars.items()}
+    return scenario.model_copy(update={"lidars": lidars})
 
 
 def _drive(kind: str) -> tuple[Any, tuple[float, float]]:

@@ -48,6 +48,16 @@ GROUND_M = 3e-3
 """Sigma of one more bias on the ground, which is of one colour, likewise."""
 
 
+BEAM_M = 1e-3
+"""Sigma of the bias of the ranges of one channel beside the others, likewise."""
+
+BEAM_RAD = 5e-5
+"""Sigma of the error of elevation and azimuth of one channel, likewise."""
+
+CHANNELS_APART_RAD = 0.01
+"""Usual angle between two channels: in that distance an error of the beams is another."""
+
+
 @dataclass(frozen=True)
 class RangeErrors:
     """What a config says of them, metres.
@@ -57,12 +67,23 @@ class RangeErrors:
         incidence_m: 1 sigma of its growth with 1 / cos(incidence).
         ground_m: 1 sigma of one more bias on the ground.
         surface_m: 1 sigma of one more bias on a surface, where nothing tells.
+        beam_m: 1 sigma of one more bias of the beams at one elevation, where nothing tells.
     """
 
     offset_m: float | None = None
     incidence_m: float = INCIDENCE_M
     ground_m: float = GROUND_M
     surface_m: float = SURFACE_M
+    beam_m: float = BEAM_M
+
+    @property
+    def beams(self) -> tuple[float, ...]:
+        """1 sigma of the errors of the beams at one elevation, where nothing tells.
+
+        Range (m), elevation and azimuth (rad), change of range (m/rad) and elevation with it.
+        """
+        change = (self.beam_m / CHANNELS_APART_RAD, BEAM_RAD / CHANNELS_APART_RAD)
+        return self.beam_m, BEAM_RAD, BEAM_RAD, *change
 
     @property
     def offsets(self) -> SizePrior:
@@ -74,7 +95,7 @@ def range_errors(noise: NoiseConfig) -> RangeErrors:
     """The sizes that a config states; who knows all ranges knows those at a slant, too."""
     stated_m = noise.lidar_range_bias_m
     most_m = math.inf if stated_m is None else stated_m
-    others_m = (min(usual_m, most_m) for usual_m in (INCIDENCE_M, GROUND_M, SURFACE_M))
+    others_m = (min(usual_m, most_m) for usual_m in (INCIDENCE_M, GROUND_M, SURFACE_M, BEAM_M))
     return RangeErrors(stated_m, *others_m)
 
 

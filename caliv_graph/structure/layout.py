@@ -10,6 +10,7 @@ import numpy as np
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.beams import KINDS
 from caliv_graph.trajectory.imu import exp_so3
 
 BIASES = 3
@@ -31,6 +32,8 @@ class Nuisances:
             the beams fall, change along a wall slowly.
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
             from one place, beyond what `strip` has of it.
+        beams: (N, KINDS) of the beams of the LiDARs at each of N elevations: range, elevation and
+            azimuth, the last two in rad.
         jitter_s: of the stamp of each scan, s; 0: no such variables.
         turn_rad_s: (P, 3) of the angular velocity within scans (`Problem.turn_rad_s`); not metres.
     """
@@ -43,6 +46,7 @@ class Nuisances:
     sighting: Array
     shared: float
     repeated: float
+    beams: Array = field(default_factory=lambda: np.zeros((0, KINDS)))
     jitter_s: float = 0.0
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
@@ -81,11 +85,11 @@ class Layout:
 
     In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
     were moved (6, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth with
-    incidence, and that on the ground (3), error of the vehicle's height and tilt above the ground
-    (3), errors of the angular velocity within the scans at each pose, if there are any (3),
-    jitter of the stamp of each scan, if there is any; and what belongs to one surface each:
-    planes (two tilts, offset), bias of each LiDAR on each surface, offset of each LiDAR on each
-    strip.
+    incidence, and that on the ground (3), errors of its beams at some elevations (3 each, if there
+    are any), error of the vehicle's height and tilt above the ground (3), errors of the angular
+    velocity within the scans at each pose, if there are any (3), jitter of the stamp of each scan,
+    if there is any; and what belongs to one surface each: planes (two tilts, offset), bias of each
+    LiDAR on each surface, offset of each LiDAR on each strip.
     """
 
     poses: int
@@ -96,6 +100,7 @@ class Layout:
     jitters: int = 0
     rates: int = 0
     turns: int = 0
+    beams: tuple[int, ...] = ()
 
     @property
     def strips(self) -> int:
@@ -145,6 +150,11 @@ class Layout:
     @property
     def standing(self) -> int:
         """Error of the vehicle's height above ground, and the two of its tilt."""
+        return self.beam + KINDS * sum(self.beams)
+
+    @property
+    def beam(self) -> int:
+        """First error of the beams of a LiDAR at some elevation."""
         return self.error + BIASES * self.lidars
 
     @property
@@ -174,6 +184,7 @@ class Layout:
         return np.concatenate(
             [
                 np.tile(of_lidar, self.lidars),
+                nuisances.beams.ravel(),
                 np.full(self.lidars * self.surfaces, nuisances.surface),
                 np.tile(nuisances.strip, self.lidars),
             ]

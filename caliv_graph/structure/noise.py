@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import nnls
 
-from caliv_graph.config.range_errors import RangeErrors, size_weights
+from caliv_graph.config.range_errors import RangeErrors, log_normal, size_weights
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.beams import KINDS
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
@@ -53,6 +56,9 @@ ONE_VIEW_M = 0.005
 footprint and incidence looks like another extrinsic, and no difference shows it. Data sheets state
 accuracies of ranges of one to three centimetres; a part of it changes from strip to strip. On a
 real road at 7 m (`edgar_static`) two LiDARs agree to 0.2 mm, 5 mrad beside the truth."""
+
+BEAM_SIZES = np.geomspace(0.1, 30.0, 15)
+"""Sizes of the errors of the beams in the integral, in usual ones: up to 3 cm and 1.5 mrad."""
 
 MOST_STRIP_M = 0.05
 """Its largest sigma: what is seen farther apart is no one strip."""
@@ -141,6 +147,7 @@ def fitted_noise(
     views: Views,
     weights: Array,
     solve: Callable[[Array], Array],
+    covariance: Callable[[IntArray], Array],
     layout: Layout,
     nuisances: Nuisances,
     errors: Array,
@@ -157,6 +164,7 @@ def fitted_noise(
         views: which scans are from one place.
         weights: (Q,) robust, of the system that was solved.
         solve: gives H^-1 times some columns (D, ...) of the system that was solved.
+        covariance: gives a block of H^-1, of coordinates that no surface owns.
         layout: its coordinates.
         nuisances: the levels that it was solved with.
         errors: (D,) estimated errors of the LiDARs.
@@ -190,6 +198,7 @@ def fitted_noise(
             ONE_VIEW_M if one else LEAST_M,
         ),
         repeated=1.0 if one else float(np.clip(again / (common**2 + shared), 0.0, 1.0)),
+        beams=_beam_sigmas(covariance, layout, nuisances.beams, errors, ranges),
         jitter_s=_jitter_sigma(solve, layout, nuisances.jitter_s, errors),
     )
 
@@ -271,13 +280,11 @@ def _bias_sigma(
 
     A LiDAR for whose bias its place makes up says nothing of it.
     """
-    own = np.arange(layout.error, layout.standing, BIASES)
+    own = np.arange(layout.error, layout.beam, BIASES)
     unit = np.zeros((layout.size, len(own)))
     unit[own, np.arange(len(own))] = 1.0
     known = np.linalg.inv(solve(unit)[own])
-    # Positive semidefinite but for rounding.
-    values, axes = np.linalg.eigh(0.5 * (known + known.T) - before**-2.0 * np.eye(len(own)))
-    information = (axes * np.maximum(values, 0.0)) @ axes.T
+    information = _positive(known - before**-2.0 * np.eye(len(own)))
     kinds = np.zeros(len(own), dtype=np.int64)
     prior = ranges.offsets
     weights = size_weights(information, known @ errors[own], kinds, [prior])
@@ -295,6 +302,56 @@ def _surface_sigma(
     known = max(float(_known(solve, layout, own, before).sum()), 0.0)
     total = usual**2 + float((errors[own] ** 2).sum())
     return math.sqrt(total / (1.0 + known))
+
+
+def _beam_sigmas(
+    covariance: Callable[[IntArray], Array],
+    layout: Layout,
+    before: Array,
+    errors: Array,
+    ranges: RangeErrors,
+) -> Array:
+    """(N, KINDS) 1 sigma of the errors of the beams of the LiDARs at each of N elevations.
+
+    For each LiDAR and kind the root mean square of the posterior of their common size, all else
+    integrated out: errors of the elevations hide behind those of the ranges, and behind the pitch
+    of the LiDAR, so that steps of their squares would end near zero. About it the errors have a t
+    distribution: leaves that one elevation sees are no error of all channels.
+    """
+    if not len(before):
+        return before
+    own = np.arange(layout.beam, layout.standing)
+    joint = covariance(own)
+    found = errors[own].reshape(before.shape)
+    out = np.zeros_like(before)
+    begin = 0
+    for count in layout.beams:
+        part = np.arange(begin, begin := begin + count)
+        for kind, usual in enumerate(ranges.beams):
+            at = KINDS * part + kind
+            cov, error, sigma = joint[np.ix_(at, at)], found[part, kind], before[part, kind]
+            known = np.linalg.inv(cov)
+            information = _positive(known - np.diag(sigma**-2.0))
+            middle = float(np.median(sigma))
+            shape = sigma / middle
+            prior = log_normal(usual * BEAM_SIZES, usual)
+            weights = size_weights(
+                shape[:, None] * information * shape,
+                shape * (known @ error),
+                np.zeros(count, dtype=np.int64),
+                [prior],
+            )
+            common = float(weights @ prior.sigmas**2)
+            share = np.clip(1.0 - np.diag(cov) / sigma**2, 0.0, 1.0)
+            variance = (STRIP_FREEDOM * common + error**2) / (STRIP_FREEDOM + share)
+            out[part, kind] = np.sqrt(np.minimum(variance, prior.sigmas[-1] ** 2))
+    return out
+
+
+def _positive(information: npt.NDArray[Any]) -> Array:
+    """A symmetric matrix that is positive semidefinite but for rounding."""
+    values, axes = np.linalg.eigh(0.5 * (information + information.T))
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)
 
 
 def _strip_sigmas(

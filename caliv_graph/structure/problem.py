@@ -51,6 +51,7 @@ class Problem:
         range_errors: what is stated of the errors of the ranges.
         turn_rad_s: (P, 3) 1 sigma of the errors of the angular velocity within the scans at each of
             the P poses with a scan, vehicle axes (`turns.py`); empty: points are taken at once.
+        beam_nodes: elevations of each LiDAR at which its beams err (`beams.py`); empty: none do.
     """
 
     patches: DrivePatches
@@ -68,6 +69,7 @@ class Problem:
     range_errors: RangeErrors = UNSTATED
     accelerations: Array | None = None
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    beam_nodes: tuple[Array, ...] = ()
 
     @property
     def turn_of_scan(self) -> IntArray:
@@ -171,6 +173,7 @@ def placed_sightings(
         strips,
         range_sigma_m,
         placed.T_vehicle_lidar,
+        problem.beam_nodes,
     )
 
 
@@ -184,6 +187,7 @@ def layout_of(problem: Problem, strips: Strips) -> Layout:
         lidars=len(problem.patches.lidars),
         surface_of=tuple(strips.surface.tolist()),
         turns=problem.turn_rad_s.size,
+        beams=tuple(map(len, problem.beam_nodes)),
     )
 
 

@@ -90,6 +90,7 @@ def whitened(
     data = np.swapaxes(geometry.by @ C, 1, 2)
     q = sightings.count
     J = rows_of(data, geometry.columns, size)
+    J.eliminate_zeros()
     groups, number = np.unique(group, return_inverse=True)
     by_offset = (nuisances.shared * more)[:, None] * C[:, 3]
     own_group = np.broadcast_to(number.ravel()[:, None], by_offset.shape)

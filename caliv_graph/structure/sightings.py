@@ -10,6 +10,7 @@ import numpy as np
 from caliv_graph.config.range_errors import GRAZING_COS
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.beams import SeenBeams, elevations, seen_beams
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.strips import Strips
 
@@ -42,6 +43,7 @@ class Sightings:
             degrees by 0.1 mrad, of each LiDAR to its own side.
         time_s: (Q,) weighted mean of the times of the points, seconds after the scan's stamp.
         T_vehicle_lidar: of each LiDAR, with which points of other times were moved to the stamps.
+        beams: what errors of the beams add; None: they have none.
     """
 
     scan: IntArray
@@ -50,6 +52,7 @@ class Sightings:
     noise: Array
     time_s: Array
     T_vehicle_lidar: tuple[gtsam.Pose3, ...]
+    beams: SeenBeams | None = None
 
     @property
     def count(self) -> int:
@@ -70,6 +73,7 @@ class Sightings:
             moments=self.moments[keep],
             noise=self.noise[keep],
             time_s=self.time_s[keep],
+            beams=self.beams and self.beams.only(keep),
         )
 
 
@@ -100,6 +104,7 @@ def sightings_of(
     strips: Strips,
     range_sigma_m: Array,
     T_vehicle_lidar: tuple[gtsam.Pose3, ...],
+    beam_nodes: tuple[Array, ...] = (),
 ) -> Sightings:
     """Adds up the patches of each strip in each scan.
 
@@ -110,6 +115,7 @@ def sightings_of(
         strips: which patch is on which.
         range_sigma_m: (L,) noise along the beam of each LiDAR.
         T_vehicle_lidar: of each LiDAR, with which points were moved to the stamp.
+        beam_nodes: elevations of each LiDAR at which its beams err (`beams.py`); empty: none do.
     """
     own = np.flatnonzero(strips.of_patch >= 0)
     places = moments_at_stamp[own, :3, 3]
@@ -123,9 +129,17 @@ def sightings_of(
         return Sightings(none, none, nothing, nothing, np.zeros(0), T_vehicle_lidar)
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     centres = moments_at_stamp[own, :3, 3] / moments_at_stamp[own, 3, 3, None]
-    sigma = range_sigma_m[patches.scan_lidar[patches.scan[own]]]
+    lidar = patches.scan_lidar[patches.scan[own]]
+    sigma = range_sigma_m[lidar]
     weight = point_weights(centres, normals_at_stamp[own], sigma)
-    moments = np.add.reduceat(weight[:, None, None] * moments_at_stamp[own], starts)
+    weighted = weight[:, None, None] * moments_at_stamp[own]
+    moments = np.add.reduceat(weighted, starts)
+    beams = None
+    if beam_nodes:
+        elevation = elevations(patches)[own]
+        beams = seen_beams(
+            beam_nodes, elevation, lidar, centres, normals_at_stamp[own], weighted, starts
+        )
     noise = np.zeros_like(moments)
     of_patch = weight * moments_at_stamp[own, 3, 3]
     noise[:, :3, :3] = np.add.reduceat(of_patch[:, None, None] * _noise(centres, sigma), starts)
@@ -136,6 +150,7 @@ def sightings_of(
         noise=noise,
         time_s=np.add.reduceat(of_patch * patches.time_s[own], starts) / moments[:, 3, 3],
         T_vehicle_lidar=T_vehicle_lidar,
+        beams=beams,
     )
 
 

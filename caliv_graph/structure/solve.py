@@ -126,18 +126,35 @@ class Solved(Estimate):
 
 @dataclass(frozen=True)
 class Levels:
-    """Noise levels, alike for all strips, with which a round begins: those of `Nuisances`."""
+    """Noise levels, alike for all strips, with which a round begins: those of `Nuisances`.
+
+    `beams` is (N, KINDS), or (1, KINDS) where all elevations are alike.
+    """
 
     sighting_m: float
     strip_m: float
     shared_m: float
     surface_m: float
     bias_m: float
+    beams: Array
 
     @staticmethod
     def first(sighting_m: float, strip_m: float, shared_m: float, ranges: RangeErrors) -> Levels:
         """Some levels, and what is known of the ranges before any data."""
-        return Levels(sighting_m, strip_m, shared_m, ranges.surface_m, ranges.offsets.usual)
+        return Levels(
+            sighting_m,
+            strip_m,
+            shared_m,
+            ranges.surface_m,
+            ranges.offsets.usual,
+            np.array([ranges.beams]),
+        )
+
+    def of_beams(self, elevations: int) -> Array:
+        """(N, KINDS) at N elevations, which are those that `beams` is of; 0: beams do not err."""
+        if not elevations:
+            return self.beams[:0]
+        return np.broadcast_to(self.beams, (elevations, self.beams.shape[1]))
 
     @staticmethod
     def of(found: Nuisances) -> Levels:
@@ -148,6 +165,7 @@ class Levels:
             shared_m=found.shared,
             surface_m=found.surface,
             bias_m=found.bias,
+            beams=found.beams,
         )
 
 
@@ -326,6 +344,7 @@ def _round(
         sighting=np.full(strips.count, levels.sighting_m),
         shared=levels.shared_m,
         repeated=0.0,
+        beams=levels.of_beams(sum(layout.beams)),
         turn_rad_s=problem.turn_rad_s,
     )
     weights = np.ones(sightings.count)
@@ -363,6 +382,7 @@ def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
         problem.views,
         found.weights,
         partial(system.surfaces.solve, factor),
+        partial(covariance_of, factor),
         layout,
         found.nuisances,
         state.errors,

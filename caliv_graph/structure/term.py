@@ -16,6 +16,7 @@ from caliv_graph.config.range_errors import range_errors
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
 from caliv_graph.structure.align import align_patches
+from caliv_graph.structure.beams import beam_nodes
 from caliv_graph.structure.elimination import factor_of, half_solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
@@ -197,6 +198,7 @@ def problem_of(
         views=views_of(patches, pose_of_scan, prior),
         range_errors=range_errors(config.noise),
         turn_rad_s=turn_sigmas(patches, pose_of_scan, trajectory),
+        beam_nodes=beam_nodes(patches),
     )
 
 

@@ -69,7 +69,10 @@ TRUE = {
 
 @dataclass(frozen=True)
 class Noise:
-    """Sigmas in metres; `bump_cell_m`: size of the pieces of a wall."""
+    """Sigmas in metres; `bump_cell_m`: size of the pieces of a wall.
+
+    `channel_m` is that of the ranges of each channel, half a degree high.
+    """
 
     range_m: float = 0.01
     sighting_m: float = 0.002
@@ -77,6 +80,7 @@ class Noise:
     bump_m: float = 0.005
     bump_cell_m: float = 1.5
     bias_m: float = 0.005
+    channel_m: float = 0.0
 
 
 def draw_patches(
@@ -97,6 +101,7 @@ def draw_patches(
     scan = 0
     for number, T in enumerate(extrinsics.values()):
         bias = rng.standard_normal() * noise.bias_m
+        channels = noise.channel_m * np.random.default_rng([number, 7]).standard_normal(360)
         for i, X in enumerate(T_map_vehicle):
             stamps.append(i * STEP_NS)
             scan_lidar.append(number)
@@ -132,7 +137,9 @@ def draw_patches(
                     q += np.outer(cells[w][cu, cv] + own_error, normal)
                     q_l = (q - t) @ R
                     r = np.linalg.norm(q_l, axis=1)
-                    q_l *= (1.0 + (bias + rng.standard_normal(n) * noise.range_m) / r)[:, None]
+                    own_channel = (np.degrees(np.arcsin(q_l[:, 2] / r)) // 0.5 + 180).astype(int)
+                    long = bias + channels[own_channel]
+                    q_l *= (1.0 + (long + rng.standard_normal(n) * noise.range_m) / r)[:, None]
                     h = np.column_stack([q_l, np.ones(n)])
                     c = q_l.mean(axis=0)
                     values, vectors = np.linalg.eigh((q_l - c).T @ (q_l - c) / n)

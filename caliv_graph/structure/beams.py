@@ -1,0 +1,188 @@
+"""Errors of the beams of a LiDAR that change with their elevation: its channels differ.
+
+Each channel has a range and a direction of its own, calibrated to millimetres and tenths of a
+milliradian, the same in every scan. A LiDAR that is pitched sees the wall ahead with other channels
+than that behind, and what these differ by looks like its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+
+from caliv_graph.geometry.se3 import tangent_axes
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.patches import DrivePatches
+
+KINDS = 5
+"""Of one elevation: the range, m; elevation and azimuth of the beam, rad; and how the first two
+change from there to the next channels, m/rad and rad/rad. A patch of two or three channels is
+tilted by what these differ, in every scan alike."""
+
+AZIMUTH = 2
+"""Which of them is the azimuth."""
+
+NODES = 16
+"""Elevations at most between which the errors of a LiDAR change linearly."""
+
+LEAST_APART_RAD = np.radians(0.5)
+"""Smallest distance of two of them: a patch has no less."""
+
+MEAN_AZIMUTH_RAD = 1e-5
+"""1 sigma of the mean error of the azimuth of a LiDAR: it is what its yaw means."""
+
+SHORT_M = 0.05
+"""Extent below which a sighting does not show how an error changes along it."""
+
+
+@dataclass(frozen=True)
+class SeenBeams:
+    """What the errors of the beams add to the residuals of Q sightings, at most W nodes each.
+
+    Attributes:
+        node: (Q, W) of all LiDARs, numbered through; any where `by` is zero.
+        by: (Q, W, KINDS, 4) linear in h = (p, 1), by an error of 1 at the node.
+    """
+
+    node: IntArray
+    by: Array
+
+    def only(self, keep: Array) -> SeenBeams:
+        """Those of some sightings."""
+        return SeenBeams(self.node[keep], self.by[keep])
+
+
+def elevations(patches: DrivePatches) -> Array:
+    """(N,) of the middle of each patch, rad, about the z axis of its LiDAR."""
+    x, y, z = patches.centres_lidar.T
+    return np.asarray(np.arctan2(z, np.hypot(x, y)))
+
+
+def beam_nodes(patches: DrivePatches) -> tuple[Array, ...]:
+    """Of each LiDAR the elevations (k,) between which its errors change linearly, ascending.
+
+    As many patches between two of them as between any others.
+    """
+    seen, lidar = elevations(patches), patches.scan_lidar[patches.scan]
+    out = []
+    for i in range(len(patches.lidars)):
+        own = seen[lidar == i]
+        nodes = list(np.quantile(own, np.linspace(0.0, 1.0, NODES))) if len(own) else [0.0]
+        kept = nodes[:1]
+        for node in nodes[1:]:
+            if node - kept[-1] >= LEAST_APART_RAD:
+                kept.append(node)
+        out.append(np.array(kept))
+    return tuple(out)
+
+
+def seen_beams(
+    nodes: tuple[Array, ...],
+    elevation: Array,
+    lidar: IntArray,
+    centres: Array,
+    normals: Array,
+    moments: Array,
+    starts: IntArray,
+) -> SeenBeams:
+    """What the beams' errors are in sightings, each of which is the sum of some patches.
+
+    A range that is too long by b moves points by `-b cos(incidence)` along the normal; an error of
+    the direction moves them across the beam. Over a sighting the errors of its patches are fitted
+    by a plane, along its surface only.
+
+    Args:
+        nodes: of each LiDAR (`beam_nodes`).
+        elevation: (n,) of the patches, sighting by sighting.
+        lidar: (n,) whose they are.
+        centres: (n, 3) in the lidar frame at the stamp.
+        normals: (n, 3) of their strips, likewise.
+        moments: (n, 4, 4) weighted.
+        starts: (Q,) first patch of each sighting.
+    """
+    first = np.cumsum([0, *map(len, nodes)])[:-1]
+    low, share = np.zeros(len(elevation), dtype=np.int64), np.zeros(len(elevation))
+    for i, own_nodes in enumerate(nodes):
+        own = lidar == i
+        if len(own_nodes) > 1:
+            place = np.searchsorted(own_nodes, elevation[own], side="right") - 1
+            place = np.clip(place, 0, len(own_nodes) - 2)
+            step = (elevation[own] - own_nodes[place]) / np.diff(own_nodes)[place]
+            low[own], share[own] = place, np.clip(step, 0.0, 1.0)
+        low[own] += first[i]
+    distance = np.linalg.norm(centres, axis=1)
+    flat = np.hypot(centres[:, 0], centres[:, 1])
+    along = centres / distance[:, None]
+    x, y = (centres[:, :2] / np.maximum(flat, 1e-9)[:, None]).T
+    up, left = np.zeros_like(centres), np.zeros_like(centres)
+    up[:, 0], up[:, 1], up[:, 2] = -along[:, 2] * x, -along[:, 2] * y, flat / distance
+    left[:, 0], left[:, 1] = -y, x
+    by_kind = [
+        np.einsum("ni,ni->n", normals, moved)
+        for moved in (along, distance[:, None] * up, flat[:, None] * left)
+    ]
+    value = -np.stack([*by_kind, *by_kind[:2]], axis=1)
+
+    number = np.zeros(len(elevation), dtype=np.int64)
+    number[starts[1:]] = 1
+    number = np.cumsum(number)
+    several = int(sum(map(len, nodes)))
+    key = np.concatenate([number * several + low, number * several + low + (share > 0.0)])
+    weight = np.concatenate([1.0 - share, share])
+    steeper = np.column_stack([up, -np.einsum("ni,ni->n", up, centres)]) / distance[:, None]
+    changes = np.einsum("nij,nj->ni", moments, steeper)
+    parts = [moments[:, :, 3]] * 3 + [changes] * 2
+    by_point = np.tile(value[:, :, None] * np.stack(parts, axis=1), (2, 1, 1))
+    keys, at = np.unique(key, return_inverse=True)
+    total = np.zeros((len(keys), KINDS, 4))
+    np.add.at(total, at.ravel(), weight[:, None, None] * by_point)
+
+    of, node = np.divmod(keys, several)
+    S = np.add.reduceat(moments, starts)
+    N = _in_plane(S, normals[starts])
+    inner = np.swapaxes(N, 1, 2) @ S @ N
+    inner[:, [1, 2], [1, 2]] += S[:, 3, 3, None] * SHORT_M**2
+    right = np.einsum("eij,eki->ejk", N[of], total)
+    fitted = np.swapaxes(N[of] @ np.linalg.solve(inner[of], right), 1, 2)
+    begin = np.searchsorted(of, np.arange(len(starts)))
+    place = np.arange(len(keys)) - begin[of]
+    width = int(place.max(initial=-1)) + 1
+    out = SeenBeams(
+        np.zeros((len(starts), width), dtype=np.int64), np.zeros((len(starts), width, KINDS, 4))
+    )
+    out.node[of, place] = node
+    out.by[of, place] = fitted
+    return out
+
+
+def mean_azimuth_rows(
+    beams: tuple[int, ...], first: int, errors: Array
+) -> tuple[scipy.sparse.csr_array, Array]:
+    """Rows (n, D) and residuals (n,) of the mean error of the azimuth of each of n LiDARs.
+
+    By its own sigma. A turn about the axis of the channels is the same as an error of all their
+    azimuths: left to the priors of these, a turn of 0.4 mrad passed for sixteen errors.
+
+    Args:
+        beams: number of elevations of each LiDAR.
+        first: coordinate of the first error of the beams.
+        errors: (D,).
+    """
+    lidar = np.repeat(np.arange(len(beams)), beams)
+    azimuth = first + KINDS * np.arange(len(lidar)) + AZIMUTH
+    value = 1.0 / (np.array(beams, dtype=np.float64)[lidar] * MEAN_AZIMUTH_RAD)
+    J = scipy.sparse.csr_array((value, (lidar, azimuth)), shape=(len(beams), len(errors)))
+    return J, np.asarray(J @ errors)
+
+
+def _in_plane(moments: Array, normals: Array) -> Array:
+    """(Q, 4, 3) functions of h: one, and the two places along the surface about the middle."""
+    axes = tangent_axes(normals)
+    centroid = moments[:, :3, 3] / moments[:, 3, 3, None]
+    N = np.zeros((len(moments), 4, 3))
+    N[:, 3, 0] = 1.0
+    N[:, :3, 1:] = np.swapaxes(axes, 1, 2)
+    N[:, 3, 1:] = -np.einsum("qki,qi->qk", axes, centroid)
+    return N

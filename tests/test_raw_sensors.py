@@ -17,12 +17,12 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.calibration.check import check
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, pose_problem
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
 from caliv_graph.pipeline import calibrate
-from caliv_graph.pipeline import run as pipeline
 from caliv_graph.products import Array, LidarScan, TargetObservation
 from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.results.run import CalibrationRun
@@ -78,14 +78,13 @@ def drive() -> Drive:
 def run_and_tested() -> tuple[CalibrationRun, Sequence[VehicleTrajectory]]:
     """A calibration, and the trajectories that its inputs were tested on."""
     seen: list[Sequence[VehicleTrajectory]] = []
-    check = pipeline.check
 
     def watched(*args: Any, **more: Any) -> Any:
         seen.append(args[3])
         return check(*args, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "check", watched)
+        patch.setattr("caliv_graph.pipeline.run.check", watched)
         found = calibrate([drive().recording], drive().config, SilentProgress())
     (tested,) = seen
     return found, tested
@@ -135,6 +134,7 @@ def test_a_late_clock_is_found() -> None:
 def test_inputs_are_tested_on_the_motion_that_the_result_has() -> None:
     """With the slow errors of the fixes in it: without, 20 mm of them look like a wrong height."""
     found, tested = run_and_tested()
+    assert found.record is not None
     for one, used in zip(tested, found.record.trajectories, strict=True):
         assert isinstance(used, SmoothedTrajectory)
         assert used.correlated

@@ -12,6 +12,7 @@ import numpy as np
 
 from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.beams import KINDS
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
 from caliv_graph.structure.jitter import jitter_sigma_s, told_clocks, told_of_jitters
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
@@ -205,9 +206,12 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
 def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
     """`solve_structure` with the fewest steps that find the strips: for what is not the result.
 
+    All channels of a LiDAR are taken as alike.
+
     Raises:
         SolveError: the system is singular.
     """
+    problem = replace(problem, beam_nodes=())
     range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     state, levels = _rough(problem, start, range_sigma)
     found = _round(problem, state, range_sigma, GATES_M[0], levels)
@@ -223,17 +227,22 @@ def _rough(
 ) -> tuple[State, Levels]:
     """The estimate after the rounds with wide gates, of some of the scans, and noise levels."""
     some, poses = with_scans(problem, some_scans(problem.patches))
+    # Channels differ by less than these gates; their errors take half of the time of a step.
+    some = replace(some, beam_nodes=())
     rough = first_state(some, start)
     levels = Levels.first(
         FIRST_SIGHTING_M, FIRST_SIGHTING_M, FIRST_SIGHTING_M, problem.range_errors
     )
+    more, beam = KINDS * sum(map(len, problem.beam_nodes)), 0
     for gate in ROUGH_GATES_M:
         found = _round(some, rough, range_sigma, gate, levels)
         if found is None:
             break
         found = _settled(found, steps=2)
-        levels = Levels.of(found.nuisances)
-        rough = found.state
+        levels = replace(Levels.of(found.nuisances), beams=levels.beams)
+        rough, beam = found.state, found.layout.beam
+    if len(rough.errors):
+        rough = replace(rough, errors=np.insert(rough.errors, np.full(more, beam), 0.0))
     return on_all_poses(problem.prior, poses, rough), levels
 
 

@@ -204,6 +204,8 @@ class _Residuals:
             moved.gravity_m_s2,
             moved.speed_scale,
         )
+        if not moved.speed_alone:
+            return r
         # The axes in which they are measured turn with the mounting of the IMU, the roots do not.
         # Lateral parts of several forward velocities around a node are noise, of metres per second:
         # turned into the forward part, they would tell the mounting.

@@ -153,9 +153,12 @@ def settle(
         linear = _with_variable(estimate.graph.factors.linearize(estimate.values), columns)
         offset = np.concatenate([np.asarray(p.offset) for p in parameters])
         tree = _eliminated(linear, len(nodes), data.yaw_bias, -offset, sigmas)
-        solution = tree.optimize()
+        try:
+            solution = tree.optimize()
+            root = tree.marginalFactor(key_parameters(), gtsam.EliminateQR)
+        except RuntimeError:  # GTSAM's report of a singular system
+            raise TrajectoryError(UNDETERMINED) from None
         step = np.asarray(solution.at(key_parameters()))
-        root = tree.marginalFactor(key_parameters(), gtsam.EliminateQR)
         cov = inverse_of(root.information())
         enough = STEP_SIGMAS if tolerance == ERROR_TOLERANCE else ROUGH_STEP_SIGMAS
         if (np.abs(step) < enough * np.sqrt(np.diag(cov))).all() or number == MAX_STEPS:

@@ -14,7 +14,7 @@ SPEED_SCALE_SIGMA = 0.02
 
 
 class WheelsConfig(Section):
-    """The wheels of a vehicle, as a source of its motion where there is no IMU."""
+    """The wheels of a vehicle, as a source of its motion; with an IMU their scale alone counts."""
 
     T_vehicle_wheels: PoseConfig = Field(
         PoseConfig(xyz=(0.0, 0.0, 0.0)),

@@ -21,8 +21,8 @@ KINDS = 5
 change from there to the next channels, m/rad and rad/rad. A patch of two or three channels is
 tilted by what these differ, in every scan alike."""
 
-AZIMUTH = 2
-"""Which of them is the azimuth."""
+RANGE, AZIMUTH = 0, 2
+"""Which of them are the range and the azimuth."""
 
 NODES = 16
 """Elevations at most between which the errors of a LiDAR change linearly."""
@@ -30,8 +30,9 @@ NODES = 16
 LEAST_APART_RAD = np.radians(0.5)
 """Smallest distance of two of them: a patch has no less."""
 
-MEAN_AZIMUTH_RAD = 1e-5
-"""1 sigma of the mean error of the azimuth of a LiDAR: it is what its yaw means."""
+MEANS = {RANGE: 1e-4, AZIMUTH: 1e-5}
+"""1 sigma of the mean error of all elevations of a LiDAR, by kind, m and rad: that of the ranges is
+its bias, which has a variable of its own, and that of the azimuth is what its yaw means."""
 
 SHORT_M = 0.05
 """Extent below which a sighting does not show how an error changes along it."""
@@ -157,24 +158,31 @@ def seen_beams(
     return out
 
 
-def mean_azimuth_rows(
+def mean_rows(
     beams: tuple[int, ...], first: int, errors: Array
 ) -> tuple[scipy.sparse.csr_array, Array]:
-    """Rows (n, D) and residuals (n,) of the mean error of the azimuth of each of n LiDARs.
+    """Rows (2 n, D) and residuals (2 n,) of the mean errors of each of n LiDARs, by their sigmas.
 
-    By its own sigma. A turn about the axis of the channels is the same as an error of all their
-    azimuths: left to the priors of these, a turn of 0.4 mrad passed for sixteen errors.
+    Of `MEANS`. A turn about the axis of the channels is the same as an error of all their azimuths:
+    left to the priors of these, a turn of 0.4 mrad passed for sixteen errors.
 
     Args:
         beams: number of elevations of each LiDAR.
         first: coordinate of the first error of the beams.
         errors: (D,).
     """
-    lidar = np.repeat(np.arange(len(beams)), beams)
-    azimuth = first + KINDS * np.arange(len(lidar)) + AZIMUTH
-    value = 1.0 / (np.array(beams, dtype=np.float64)[lidar] * MEAN_AZIMUTH_RAD)
-    J = scipy.sparse.csr_array((value, (lidar, azimuth)), shape=(len(beams), len(errors)))
+    n = len(beams)
+    lidar = np.repeat(np.arange(n), beams)
+    column = np.concatenate([first + KINDS * np.arange(len(lidar)) + kind for kind in MEANS])
+    row = np.concatenate([lidar + n * i for i in range(len(MEANS))])
+    each = [mean_weight(beams[i], kind) for kind in MEANS for i in lidar.tolist()]
+    J = scipy.sparse.csr_array((np.array(each), (row, column)), shape=(len(MEANS) * n, len(errors)))
     return J, np.asarray(J @ errors)
+
+
+def mean_weight(count: int, kind: int) -> float:
+    """The entry of a row of `mean_rows`, of a LiDAR with `count` elevations; 0: it has none."""
+    return 1.0 / (count * MEANS[kind]) if kind in MEANS else 0.0
 
 
 def _in_plane(moments: Array, normals: Array) -> Array:

@@ -32,8 +32,8 @@ class Nuisances:
             the beams fall, change along a wall slowly.
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
             from one place, beyond what `strip` has of it.
-        beams: (N, KINDS) of the beams of the LiDARs at each of N elevations: range, elevation and
-            azimuth, the last two in rad.
+        beams: (N, KINDS) of the beams of the LiDARs at each of N elevations (`beams.KINDS`): m,
+            rad, rad, m/rad, rad/rad.
         jitter_s: of the stamp of each scan, s; 0: no such variables.
         turn_rad_s: (P, 3) of the angular velocity within scans (`Problem.turn_rad_s`); not metres.
     """
@@ -85,11 +85,11 @@ class Layout:
 
     In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
     were moved (6, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth with
-    incidence, and that on the ground (3), errors of its beams at some elevations (3 each, if there
-    are any), error of the vehicle's height and tilt above the ground (3), errors of the angular
-    velocity within the scans at each pose, if there are any (3), jitter of the stamp of each scan,
-    if there is any; and what belongs to one surface each: planes (two tilts, offset), bias of each
-    LiDAR on each surface, offset of each LiDAR on each strip.
+    incidence, and that on the ground (3), errors of its beams at some elevations (`KINDS` each, if
+    there are any), error of the vehicle's height and tilt above the ground (3), errors of the
+    angular velocity within the scans at each pose, if there are any (3), jitter of the stamp of
+    each scan, if there is any; and what belongs to one surface each: planes (two tilts, offset),
+    bias of each LiDAR on each surface, offset of each LiDAR on each strip.
     """
 
     poses: int

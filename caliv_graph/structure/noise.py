@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 
 from caliv_graph.config.range_errors import RangeErrors, log_normal, size_weights
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.beams import KINDS
+from caliv_graph.structure.beams import KINDS, mean_weight
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
@@ -58,7 +58,8 @@ accuracies of ranges of one to three centimetres; a part of it changes from stri
 real road at 7 m (`edgar_static`) two LiDARs agree to 0.2 mm, 5 mrad beside the truth."""
 
 BEAM_SIZES = np.geomspace(0.1, 30.0, 15)
-"""Sizes of the errors of the beams in the integral, in usual ones: up to 3 cm and 1.5 mrad."""
+"""Sizes of the errors of the beams in the integral, in usual ones: up to 3 cm and 1.5 mrad, unless
+less is stated of the ranges."""
 
 MOST_STRIP_M = 0.05
 """Its largest sigma: what is seen farther apart is no one strip."""
@@ -331,7 +332,9 @@ def _beam_sigmas(
             at = KINDS * part + kind
             cov, error, sigma = joint[np.ix_(at, at)], found[part, kind], before[part, kind]
             known = np.linalg.inv(cov)
-            information = _positive(known - np.diag(sigma**-2.0))
+            # Without the priors; that the mean is zero says nothing of the size.
+            of_mean = np.full((count, count), mean_weight(count, kind) ** 2)
+            information = _positive(known - np.diag(sigma**-2.0) - of_mean)
             middle = float(np.median(sigma))
             shape = sigma / middle
             prior = log_normal(usual * BEAM_SIZES, usual)

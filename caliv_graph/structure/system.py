@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse
 
 from caliv_graph.products import Array
-from caliv_graph.structure.beams import mean_azimuth_rows
+from caliv_graph.structure.beams import mean_rows
 from caliv_graph.structure.elimination import Surfaces, eliminated
 from caliv_graph.structure.layout import Layout, Nuisances, State
 from caliv_graph.structure.prior import PosePrior
@@ -59,7 +59,7 @@ def system_of(
         layout.size,
     )
     sparse, right = sparse + J.T @ J, right - J.T @ r
-    J, r = mean_azimuth_rows(layout.beams, layout.beam, state.errors)
+    J, r = mean_rows(layout.beams, layout.beam, state.errors)
     sparse, right = sparse + J.T @ J, right - J.T @ r
     weight = np.zeros(layout.size)
     weight[layout.plane : layout.surface_error] = np.tile(

@@ -13,7 +13,7 @@ from caliv_graph.scenario.drive_models import StandstillDrive
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.world import make_world
-from caliv_graph.scenario.world_models import BodyBoxModel, GroundModel, WorldModel
+from caliv_graph.scenario.world_models import BodyBoxModel, GroundModel, WallModel, WorldModel
 from caliv_graph.simulation.lidar import ChannelErrors, SimulatedLidar
 from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.simulation.recording import simulate_drive
@@ -107,3 +107,42 @@ def test_drawn_errors_are_each_lidar_s_own_and_in_the_truth() -> None:
             plain.points_lidar, axis=1
         )
         np.testing.assert_allclose(longer_m, bias_m, atol=1e-9)
+
+
+def test_errors_of_channels_are_drawn_once_per_lidar_and_drive() -> None:
+    scenario = biased_scenario(channel_bias_sigma_m=0.02, channel_direction_sigma_mrad=2.0)
+    right, wrong = (simulate_drive(each, seed=3) for each in (biased_scenario(), scenario))
+    assert not right.channel_errors
+    assert set(wrong.channel_errors) == {"one", "other"}
+    for name, errors in wrong.channel_errors.items():
+        for scan, without in zip(wrong.scans(name), right.scans(name), strict=True):
+            seen = scan.points_lidar.reshape(5, 2, 3)
+            nominal = without.points_lidar.reshape(5, 2, 3)
+            # Nominal directions, true ranges of the turned beams, and the channel's own error.
+            direction = nominal / np.linalg.norm(nominal, axis=2, keepdims=True)
+            ranges_m = np.linalg.norm(seen, axis=2)
+            np.testing.assert_allclose(seen, ranges_m[..., None] * direction, atol=1e-9)
+            # The vehicle stands as high as it drew it.
+            height_m = -nominal[:, 0, 2]
+            down = np.arcsin(-direction[:, 0, 2]) - errors.elevation_rad
+            expected_m = height_m / np.sin(down) + errors.range_m
+            np.testing.assert_allclose(ranges_m[:, 0], expected_m, atol=1e-5)
+    first, second = wrong.channel_errors.values()
+    assert (first.range_m != second.range_m).all()
+    assert np.abs(first.elevation_rad).max() < 8e-3
+
+
+def test_a_channel_that_is_turned_to_the_left_sees_the_wall_there() -> None:
+    """A wall that goes off to the left: a beam further left meets it later."""
+    wall = WallModel(xy_m=(10.0, 0.0), yaw_deg=45.0, length_m=40.0, height_m=8.0, bumps_sigma_m=0.0)
+    world = make_world(WorldModel(objects={"wall": wall}), ())
+    level = LIDAR.model_copy(update={"elevations_deg": (-1.0, 1.0)})
+    ranges_m = []
+    for azimuth_rad in (0.0, 0.01):
+        errors = ChannelErrors(np.zeros(2), np.zeros(2), np.full(2, azimuth_rad))
+        rng = np.random.default_rng(1)
+        lidar = SimulatedLidar(level, world, RayCaster(world), None, rng, 0.0, errors)
+        ranges_m.append(np.linalg.norm(lidar.scan(gtsam.Pose3()).points_lidar, axis=1))
+    change_m = ranges_m[1] - ranges_m[0]
+    # 10 m away, at 45 degrees: 0.1 m, and 30 percent more or less 10 degrees to either side.
+    assert change_m == pytest.approx(0.1, rel=0.5)

@@ -68,8 +68,12 @@ def test_orientations_in_parts_are_those_of_the_whole(
     assert turn[2] == pytest.approx(0.2 * 3.9, abs=2e-3)
 
 
-def test_forward_velocities_of_a_pitching_vehicle_agree_with_its_motion() -> None:
-    """Gravity adds to each until the node, along axes that turn: 5 mm/s at half a rad/s."""
+@pytest.mark.parametrize("height_m", [0.0, 0.4])
+def test_forward_velocities_of_a_pitching_vehicle_agree_with_its_motion(height_m: float) -> None:
+    """Gravity adds to each until the node, along axes that turn: 5 mm/s at half a rad/s.
+
+    Of a point above the vehicle's origin they are larger while it pitches nose down.
+    """
     rate, speed = 0.5, 3.0
     at = 10**12 + 2_000_000 * np.arange(1001)
     seconds = (at - at[0]) * 1e-9
@@ -78,11 +82,13 @@ def test_forward_velocities_of_a_pitching_vehicle_agree_with_its_motion() -> Non
     force = np.array([0.0, 0.0, -rate * speed]) + 9.8 * turned[:, 2]
     dead = DeadReckoning(at, gyro, force)
     nodes = at[0] + 100_000_000 * np.arange(1, 19)
-    odometry = TwistSamples(at[25:-25:5], np.tile([speed, 0.0, 0.0], (len(at[25:-25:5]), 1)))
+    measured = speed + rate * height_m
+    odometry = TwistSamples(at[25:-25:5], np.tile([measured, 0.0, 0.0], (len(at[25:-25:5]), 1)))
     cov = np.tile(np.diag([0.03**2, 10.0**2, 10.0**2]), (len(odometry.stamps_ns), 1, 1))
     samples = ImuSamples(at, gyro, force)
     noise = imu_noise(samples, config_for(Sensors()))
-    found = velocities_at_nodes(odometry, cov, nodes, dead, noise, gtsam.Pose3())
+    T_vehicle_twist = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, height_m]))
+    found = velocities_at_nodes(odometry, cov, nodes, dead, noise, T_vehicle_twist.inverse())
     assert found is not None
     R = np.array([gtsam.Rot3.Ry(rate * s).matrix() for s in (nodes - at[0]) * 1e-9])
     none = np.zeros((len(nodes), 3))

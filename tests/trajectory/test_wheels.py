@@ -18,6 +18,7 @@ from caliv_graph.products import Array, MotionData, TwistSamples
 from caliv_graph.scenario.drives import Drive
 from caliv_graph.trajectory.heading import heading_disagreement
 from caliv_graph.trajectory.inputs import check_input
+from caliv_graph.trajectory.parameters import SPEED_POINT
 from caliv_graph.trajectory.physics import motion_physics
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -125,6 +126,17 @@ def test_with_an_imu_scale_and_place_of_the_speed_are_found() -> None:
     exact = smooth_trajectory(beside_imu(3), settings(speed_scale_sigma=0), wanted)
     assert exact.data.speed_scale == 1.0
     assert exact.sigmas_of("twist.scale") is None
+
+
+def test_the_place_of_the_speed_is_to_the_left_and_above_the_origin() -> None:
+    data, _ = check_input(beside_imu(3), settings())
+    assert data.T_vehicle_twist.equals(gtsam.Pose3(), 0.0)
+    moved = SPEED_POINT.moved(data, np.array([0.1, 0.4]))
+    assert moved.T_vehicle_twist.translation().tolist() == [0.0, 0.1, 0.4]
+    # Without an IMU the axle's frame stands in for it, and is where the speed is measured.
+    alone, _ = check_input(wheels(3), settings())
+    assert not alone.speed_alone
+    assert alone.T_vehicle_twist.equals(alone.T_vehicle_imu, 0.0)
 
 
 def test_forward_speeds_do_not_tell_how_an_imu_is_turned() -> None:

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.patches import DrivePatches, along_surface
 
 KINDS = 5
 """Of one elevation: the range, m; elevation and azimuth of the beam, rad; and how the first two
@@ -126,9 +125,7 @@ def seen_beams(
     ]
     value = -np.stack([*by_kind, *by_kind[:2]], axis=1)
 
-    number = np.zeros(len(elevation), dtype=np.int64)
-    number[starts[1:]] = 1
-    number = np.cumsum(number)
+    number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(elevation)))
     several = int(sum(map(len, nodes)))
     key = np.concatenate([number * several + low, number * several + low + (share > 0.0)])
     weight = np.concatenate([1.0 - share, share])
@@ -142,7 +139,7 @@ def seen_beams(
 
     of, node = np.divmod(keys, several)
     S = np.add.reduceat(moments, starts)
-    N = _in_plane(S, normals[starts])
+    N = along_surface(S, normals[starts])
     inner = np.swapaxes(N, 1, 2) @ S @ N
     inner[:, [1, 2], [1, 2]] += S[:, 3, 3, None] * SHORT_M**2
     right = np.einsum("eij,eki->ejk", N[of], total)
@@ -183,14 +180,3 @@ def mean_rows(
 def mean_weight(count: int, kind: int) -> float:
     """The entry of a row of `mean_rows`, of a LiDAR with `count` elevations; 0: it has none."""
     return 1.0 / (count * MEANS[kind]) if kind in MEANS else 0.0
-
-
-def _in_plane(moments: Array, normals: Array) -> Array:
-    """(Q, 4, 3) functions of h: one, and the two places along the surface about the middle."""
-    axes = tangent_axes(normals)
-    centroid = moments[:, :3, 3] / moments[:, 3, 3, None]
-    N = np.zeros((len(moments), 4, 3))
-    N[:, 3, 0] = 1.0
-    N[:, :3, 1:] = np.swapaxes(axes, 1, 2)
-    N[:, 3, 1:] = -np.einsum("qki,qi->qk", axes, centroid)
-    return N

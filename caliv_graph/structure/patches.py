@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import skew
+from caliv_graph.geometry.se3 import skew, tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray
 
 
@@ -139,3 +139,17 @@ class DrivePatches:
     def centres_lidar(self) -> Array:
         """(N, 3) centroids, metres, lidar frame as of the patch's own time."""
         return self.moments[:, :3, 3] / self.moments[:, 3, 3, None]
+
+
+def along_surface(moments: Array, normals: Array) -> Array:
+    """(N, 4, 3) functions of h: one, and the two places (m) along a surface about the middle.
+
+    Of moments (N, 4, 4), on surfaces with these normals (N, 3).
+    """
+    axes = tangent_axes(normals)
+    centroid = moments[:, :3, 3] / moments[:, 3, 3, None]
+    out = np.zeros((len(moments), 4, 3))
+    out[:, 3, 0] = 1.0
+    out[:, :3, 1:] = np.swapaxes(axes, 1, 2)
+    out[:, 3, 1:] = -np.einsum("nki,ni->nk", axes, centroid)
+    return out

@@ -215,11 +215,6 @@ def geometry_of(
         by_turn = np.swapaxes(_by_turn_of_axes(apart_s * now[pose], pivot), 1, 2) @ by_pose
         by_own_pose = np.concatenate([by_own_pose[:, :3] + by_turn, by_own_pose[:, 3:]], axis=1)
         by_extrinsic = by_extrinsic + _by_compensation(sightings.time_s, present, by_extrinsic)
-    beams = sightings.beams
-    if beams is not None:
-        own = layout.beam + KINDS * beams.node[:, :, None] + np.arange(KINDS)
-        by_beam, own = beams.by.reshape(q, -1, 4), own.reshape(q, -1)
-        plain += np.einsum("qc,qci->qi", state.errors[own], by_beam)
     B = tangent_axes(normal)
     by_plane = np.zeros((q, 3, 4))
     by_plane[:, :2, :3] = B @ R
@@ -232,9 +227,6 @@ def geometry_of(
         layout.plane + 3 * strip[:, None] + np.arange(3),
         error_columns,
     ]
-    if beams is not None:
-        parts.append(by_beam)
-        columns.append(own)
     then, swept = None if now is None else now[pose], None
     if then is not None and change is not None:
         # Points of a late sweep moved with the velocity of then.
@@ -248,6 +240,11 @@ def geometry_of(
         own = layout.turn + 3 * turn[:, None] + np.arange(3)
         by_turn_rate = sightings.time_s[:, None, None] * by_pose[:, :3]
         moved.append((by_turn_rate, own, state.errors[own]))
+    beams = sightings.beams
+    if beams is not None:
+        own = layout.beam + KINDS * beams.node[:, :, None] + np.arange(KINDS)
+        own = own.reshape(q, -1)
+        moved.append((beams.by.reshape(q, -1, 4), own, state.errors[own]))
     for by, own, value in moved:
         plain += np.einsum("qc,qci->qi", value, by)
         parts.append(by)

@@ -8,10 +8,9 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.range_errors import GRAZING_COS
-from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.beams import SeenBeams, elevations, seen_beams
-from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.patches import DrivePatches, along_surface
 from caliv_graph.structure.strips import Strips
 
 ROUGHNESS_M = 0.003
@@ -173,12 +172,9 @@ def without_own_error(
     tilt no better than `tilt_m` (Q,) over `TILT_LENGTH_M`. `normals_lidar` (Q, 3) at the scan's
     stamp.
     """
-    S, centroid = sightings.moments, sightings.centroids_lidar
-    axes = tangent_axes(normals_lidar) / TILT_LENGTH_M
-    N = np.zeros((len(S), 4, 3))
-    N[:, 3, 0] = 1.0
-    N[:, :3, 1:] = np.swapaxes(axes, 1, 2)
-    N[:, 3, 1:] = -np.einsum("qki,qi->qk", axes, centroid)
+    S = sightings.moments
+    N = along_surface(S, normals_lidar)
+    N[:, :, 1:] /= TILT_LENGTH_M
     SN = S @ N
     inner = np.swapaxes(N, 1, 2) @ SN
     inner[:, range(3), range(3)] += np.stack([offset_m, tilt_m, tilt_m], axis=1) ** -2.0

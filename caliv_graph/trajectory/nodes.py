@@ -21,7 +21,7 @@ from caliv_graph.trajectory.measurements import (
     velocities_at_nodes,
 )
 from caliv_graph.trajectory.noise import orientation_covariances, velocity_covariances
-from caliv_graph.trajectory.wheels import forward_alone, is_planar, wheel_covariances
+from caliv_graph.trajectory.wheels import forward_alone, wheel_covariances
 
 NODE_SPACING_S = 0.1
 """Largest distance of two nodes on drives of up to `FINE_NODES` of them. A GNSS fix is then carried
@@ -112,7 +112,7 @@ def _velocity_covariances(data: SmootherInput) -> Array:
         cov, _ = wheel_covariances(twist, data.wheels, data.config)
     else:
         cov, _ = velocity_covariances(twist, data.config)
-        if is_planar(twist):
+        if data.speed_alone:
             cov = forward_alone(cov, twist)
     # Of planar velocities `speed` is estimated in the place of `velocity`.
     axes = data.scales.get("velocity", 1.0) * axes

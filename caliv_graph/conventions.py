@@ -84,6 +84,14 @@ def key_wheels_rotation() -> int:
     return int(gtsam.symbol("w", 0))
 
 
+def key_sensor_offset(index: int) -> int:
+    """Key of the time offset of a sensor of the motion, (1,) seconds, one for all drives.
+
+    0: GNSS, 1: IMU, 2: wheels.
+    """
+    return int(gtsam.symbol("f", index))
+
+
 def key_extrinsic() -> int:
     """Key of E = T_vehicle_ref, the extrinsic of the reference LiDAR."""
     return int(gtsam.symbol("e", 0))

@@ -109,17 +109,29 @@ def clock_findings(
     The ranking of suspects takes structure for fixed evidence, at a clock that is right: then it
     outvotes the target. What else is wrong beyond 5 sigma may bend walls as a late clock does.
     `names` are of the drives.
+
+    Surfaces tell the clocks of LiDARs against that of the IMU. Where this was estimated as off, the
+    fewer wrong clocks are the likelier: that of the IMU, unless one LiDAR alone explains as much.
     """
     suspects = calibration.suspects
     if suspects and suspects[0].sigmas > CONTRADICTION_SIGMAS:
         return ()
-    return tuple(
-        finding
-        for term in terms
-        for lidar, (late_s, sigma_s) in term.clocks.items()
-        for finding in [clock_finding(names[term.drive], lidar, late_s, sigma_s)]
-        if finding is not None
-    )
+    inertial = [
+        float(found.value[0])
+        for name, found in calibration.vehicle.items()
+        if name in ("imu_time_offset", "twist_time_offset")
+    ]
+
+    def against(imu_late_s: float) -> tuple[Finding, ...]:
+        return tuple(
+            finding
+            for term in terms
+            for lidar, (late_s, sigma_s) in term.clocks.items()
+            for finding in [clock_finding(names[term.drive], lidar, late_s + imu_late_s, sigma_s)]
+            if finding is not None
+        )
+
+    return min(against(0.0), against(sum(inertial)), key=len)
 
 
 def heading_findings(

@@ -448,19 +448,20 @@ class StructureTerm:
 
     Minus the log-likelihood is `d^T information d / 2 - gradient^T d`. d are, in this order, right
     perturbations of the vehicle's poses (rotation then translation, rad and m), of the parameters
-    of the vehicle (three each: metres of the lever arm; right perturbation of R_vehicle_imu), of
-    the time offsets (s), and right perturbations of T_vehicle_lidar (lidar frame). Motion data,
-    guesses and priors are not in it.
+    of the vehicle (metres of the lever arm; right perturbation of R_vehicle_imu; seconds of a
+    clock), of the time offsets (s), and right perturbations of T_vehicle_lidar (lidar frame).
+    Motion data, guesses and priors are not in it.
 
     Attributes:
         drive: index of the drive.
         stamps_ns: (m,) of the poses, those of the scans that see a target.
         T_map_vehicle: m poses at which it was linearised, the drive's map.
-        parameters: name -> value at which it was linearised (`lever_arm` (3,), a rotation).
+        parameters: name -> value at which it was linearised (`gnss.lever_arm` (3,), a rotation, a
+            time (1,)).
         time_offsets_s: LiDAR -> the same, of the LiDARs whose offset is free.
         T_vehicle_lidar: LiDAR -> the same, of the LiDARs that see structure.
-        information: (6 m + 3 k + o + 6 n,) squared.
-        gradient: (6 m + 3 k + o + 6 n,).
+        information: (6 m + p + o + 6 n,) squared.
+        gradient: (6 m + p + o + 6 n,).
         strips: the strips, for the report.
         offset_m: 1 sigma of the offset of a strip in a scan, estimated.
         ground: LiDARs whose ground is in it, and the vehicle's stand on it if that is known.
@@ -632,6 +633,9 @@ class LinearisedGraph:
 TURNS = ("imu_rotation", "wheels_rotation", "heading_yaw")
 """Names of parameters of the vehicle that are rotations: radians here, degrees in files."""
 
+TIME_OFFSETS = ("gnss_time_offset", "imu_time_offset", "twist_time_offset")
+"""Names of those that are stamps of a sensor less the true times, in the clock of the LiDARs."""
+
 
 @dataclass(frozen=True)
 class VehicleParameter:
@@ -639,9 +643,9 @@ class VehicleParameter:
 
     Attributes:
         value: (3,) lever arm in metres, vehicle frame; or roll, pitch, yaw of T_vehicle_imu or
-            T_vehicle_wheels in rad; or (drives,) measured over true speeds, or the direction of
-            the baseline of two antennas in rad.
-        sigma: (3,) or (drives,) in the same unit; of a rotation about the vehicle's axes. The
+            T_vehicle_wheels in rad; or (1,) time offset of a sensor in seconds; or (drives,)
+            measured over true speeds, or the direction of the baseline of two antennas in rad.
+        sigma: (3,), (1,) or (drives,) in the same unit; of a rotation about the vehicle's axes. The
             user's own sigma is part of it.
         determined: per coordinate whether the drive alone determines it.
         limits: axes of S2V of which half the variance or more comes from it.

@@ -18,7 +18,7 @@ from caliv_graph.physics import (
     warnings_of,
     with_cause,
 )
-from caliv_graph.products import Finding, StructureTerm, Suspect
+from caliv_graph.products import Finding, StructureTerm, Suspect, VehicleParameter
 from tests.samples import make_calibration
 
 
@@ -104,6 +104,13 @@ def test_a_clock_that_walls_contradict_leads_where_the_ranking_has_no_culprit() 
     first, _ = ranked_with(calm, [found]).suspects
     assert (first.input, first.value, first.change) == (clock.input, (0.0191,), (0.0191,))
     assert (first.sigmas, first.sigma) == (found.sigmas, (found.sigma,))
+    # An IMU that is late explains both clocks, one LiDAR that is late its own alone.
+    early = (-0.02, 0.0)
+    imu = {"imu_time_offset": VehicleParameter(np.array([0.02]), np.array([1e-3]), (True,))}
+    late = replace(calm, vehicle=imu)
+    assert clock_findings(["drive"], [term(front=early, rear=early)], late) == ()
+    (alone,) = clock_findings(["drive"], [term(front=early, rear=(0.0, 0.0))], late)
+    assert alone.input == "lidars.front.time_offset"
     # 4.5 sigma are a warning, 3.9 are nothing.
     (doubt,) = clock_findings(["drive"], [term(front=(-0.009, 0.0))], calm)
     assert doubt.severity == "warning"

@@ -14,6 +14,7 @@ from dataclasses import replace
 import gtsam
 from threadpoolctl import threadpool_limits
 
+from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
 from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.linear import linearise_clouds
@@ -38,7 +39,12 @@ from caliv_graph.calibration.sensor_noise import (
     noise_of_motion,
     with_noise,
 )
-from caliv_graph.calibration.solve import solve_registered
+from caliv_graph.calibration.solve import (
+    reduced_registered,
+    settle,
+    solve_registered,
+    step_of_all,
+)
 from caliv_graph.calibration.staged import staged_solution
 from caliv_graph.calibration.structure import lidars_with_structure
 from caliv_graph.calibration.structure_evidence import (
@@ -188,6 +194,10 @@ def _estimate(
         rough = replace(rough, offsets_s=offsets_s)
     else:
         solve = solve_registered(problem, registrations, grounds, config, found)
+    if has_clock(problem):
+        reduced = reduced_registered(solve, registrations)
+        solve = under_clock_prior(solve, reduced, None)
+        settle(solve, registrations, step_of_all(solve))
     times["graph"] = rough.graph_s
     most = refinements(config.noise.lidar_range_m)
     total = most + OTHER_STARTS * further_refinements(config.noise.lidar_range_m)

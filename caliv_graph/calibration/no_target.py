@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
 from caliv_graph.calibration.graph import initial_values, motion_graph
 from caliv_graph.calibration.ground import drives_with_planes, ground_values
 from caliv_graph.calibration.ground_weights import ground_weights
@@ -145,6 +146,9 @@ def solve_structure_and_ground(
     with progress.stage("solving the graph", COUPLED_STEPS) as advance:
         loop = _Loop(problem, terms, grounds, config)
         loop.solve(advance)
+        if has_clock(problem):
+            loop.again(under_clock_prior(loop.state, loop.reduced, loop.undetermined), advance)
+            problem = loop.state.problem
         offsets_s = reduced_offset_sigmas(problem, loop.reduced)
     times["graph"] = time.perf_counter() - begun
     return StructureSolve(
@@ -236,6 +240,12 @@ class _Loop:
             )
             self.converged = sigmas < COUPLED_SIGMAS and change < WEIGHT_TOLERANCE
             advance()
+
+    def again(self, state: SolveState, advance: Callable[..., None]) -> None:
+        """The same of another state at the same values."""
+        self.state, self.converged = state, False
+        self.reduced = self._linearised()
+        self.solve(advance)
 
     def _weigh(self) -> float:
         """New weights of the ground; their largest change."""

@@ -89,7 +89,7 @@ def _smoothed(
         information=joint.information,
         gradient=joint.gradient,
         parameter_information=(
-            np.asarray(scipy.linalg.block_diag(*np.linalg.inv(covs))) if covs else nothing
+            np.asarray(scipy.linalg.block_diag(*map(np.linalg.inv, covs))) if covs else nothing
         ),
         parameter_offset=np.concatenate([np.zeros(0), *offsets]),
         chart=chart_of(trajectory),

@@ -132,8 +132,8 @@ def _coordinates(solution: Solution, term: StructureTerm) -> tuple[Array, Array]
     for name, own in rows_of_parameters(term).items():
         value = term.parameters[name]
         if KEYS[name] in graph.starts:
-            start = graph.starts[KEYS[name]]
-            rows[own, start : start + 3] = np.eye(3)
+            start, size = graph.starts[KEYS[name]], own.stop - own.start
+            rows[own, start : start + size] = np.eye(size)
             if isinstance(value, gtsam.Rot3):
                 moved[own] = value.localCoordinates(values.atRot3(KEYS[name]))
             else:

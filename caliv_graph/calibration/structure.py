@@ -66,13 +66,17 @@ def nearest_extrinsics(
 
 def rows_of_parameters(term: StructureTerm) -> dict[str, slice]:
     """Where the coordinates of each parameter of the vehicle are in a term, after its poses."""
-    first = 6 * len(term.stamps_ns)
-    return {name: slice(first + 3 * i, first + 3 * i + 3) for i, name in enumerate(term.parameters)}
+    out, first = {}, 6 * len(term.stamps_ns)
+    for name, value in term.parameters.items():
+        out[name] = slice(first, first + tangent_size(value))
+        first = out[name].stop
+    return out
 
 
 def rows_of_offsets(term: StructureTerm) -> dict[str, int]:
     """Where the time offset of each LiDAR that has one is in a term, after its parameters."""
-    first = 6 * len(term.stamps_ns) + 3 * len(term.parameters)
+    sizes = [tangent_size(value) for value in term.parameters.values()]
+    first = 6 * len(term.stamps_ns) + sum(sizes)
     return {name: first + i for i, name in enumerate(term.time_offsets_s)}
 
 
@@ -117,7 +121,7 @@ def _gaussian(
         row += 6
     for name, rows in rows_of_parameters(term).items():
         if KEYS[name] in point:
-            by_graph[rows, columns[KEYS[name]]] = np.eye(3)
+            by_graph[rows, columns[KEYS[name]]] = np.eye(rows.stop - rows.start)
     for name, at in rows_of_offsets(term).items():
         if name in problem.offsets:
             by_graph[at, columns[key_offset(problem.lidars.index(name))]] = 1.0

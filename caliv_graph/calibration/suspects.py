@@ -211,7 +211,7 @@ def _shared(solution: Solution, trajectories: Sequence[VehicleTrajectory]) -> di
             out[name] = _Shared(start, to_right, to_right @ moved)
         else:
             moved = solution.values.atVector(KEYS[name]) - prior.mean
-            out[name] = _Shared(start, np.eye(3), moved)
+            out[name] = _Shared(start, np.eye(len(moved)), moved)
     return out
 
 

@@ -1,4 +1,4 @@
-"""Lever arm and rotation of the IMU in the calibration graph: one of each for all drives.
+"""Lever arm, rotation of the IMU and clock of the GNSS in the graph: one of each for all drives.
 
 The motion data of a drive are a Gaussian on its poses and on them (`README.md`, section 17).
 """
@@ -15,16 +15,27 @@ from scipy.linalg import block_diag
 
 from caliv_graph.calibration.heave import with_heave
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
-from caliv_graph.conventions import key_imu_rotation, key_lever_arm, key_wheels_rotation
+from caliv_graph.conventions import (
+    NANOSECONDS_PER_SECOND,
+    key_imu_rotation,
+    key_lever_arm,
+    key_sensor_offset,
+    key_wheels_rotation,
+)
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.products import Array, IntArray, VehicleParameter
 from caliv_graph.trajectory.chain import POSE
+from caliv_graph.trajectory.factors import tangent_size
+from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK
 from caliv_graph.trajectory.parameters import (
+    GNSS_TIME_OFFSET,
     HEADING_YAW,
     IMU_ROTATION,
+    IMU_TIME_OFFSET,
     LEVER_ARM,
     SPEED_SCALE,
     WHEELS_ROTATION,
+    WHEELS_TIME_OFFSET,
     mount_rotation,
 )
 from caliv_graph.trajectory.select import VehicleTrajectory
@@ -37,21 +48,38 @@ KEYS = {
     LEVER_ARM.name: key_lever_arm(),
     IMU_ROTATION.name: key_imu_rotation(),
     WHEELS_ROTATION.name: key_wheels_rotation(),
+    GNSS_TIME_OFFSET.name: key_sensor_offset(0),
+    IMU_TIME_OFFSET.name: key_sensor_offset(1),
+    WHEELS_TIME_OFFSET.name: key_sensor_offset(2),
 }
-"""Parameter of the input -> its key: (3,) metres in the vehicle frame, R_vehicle_imu, and
-R_vehicle_wheels."""
+"""Parameter of the input -> its key: (3,) metres in the vehicle frame, R_vehicle_imu,
+R_vehicle_wheels, and (1,) seconds."""
 
 NAMES = {
     LEVER_ARM.name: "lever_arm",
     IMU_ROTATION.name: "imu_rotation",
     WHEELS_ROTATION.name: "wheels_rotation",
+    GNSS_TIME_OFFSET.name: "gnss_time_offset",
+    IMU_TIME_OFFSET.name: "imu_time_offset",
+    WHEELS_TIME_OFFSET.name: "twist_time_offset",
 }
 """What they are called in a result."""
+
+CLOCKS = {
+    GNSS_TIME_OFFSET.name: GNSS_CLOCK,
+    IMU_TIME_OFFSET.name: IMU_CLOCK,
+    WHEELS_TIME_OFFSET.name: IMU_CLOCK,
+}
+"""Parameters that are the time offset of a sensor -> its clock in `SmootherInput.late_ns`."""
+
+USUAL_LATE_S = 0.02
+"""1 sigma of the stamps of a sensor whose messages are stamped when they arrive."""
 
 USUAL_SIGMAS = {
     LEVER_ARM.name: DEFAULT_GUESS_SIGMAS[3:],
     IMU_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
     WHEELS_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
+    **dict.fromkeys(CLOCKS, np.full(1, USUAL_LATE_S)),
 }
 """A parameter that nobody measured is judged by the usual guess of a mount, as extrinsics are."""
 
@@ -69,8 +97,9 @@ class MotionTerm:
     `chart`, then right perturbations of the parameters about `values`.
 
     Attributes:
-        information: (6 m + 3 k, 6 m + 3 k), heave included, priors of the parameters not.
-        gradient: (6 m + 3 k,).
+        information: (6 m + p, 6 m + p), heave included, priors of the parameters not; p the
+            coordinates of all parameters.
+        gradient: (6 m + p,).
         constant: at least twice what the quadratic falls below zero.
         values: of the parameters where it was linearised, by name, in order.
         chart: of the poses.
@@ -85,17 +114,17 @@ class MotionTerm:
 
 @dataclass(frozen=True)
 class ParameterPrior:
-    """The prior of a parameter of the vehicle: its mean, and (3, 3) of its perturbation.
+    """The prior of a parameter of the vehicle: its mean, and (p, p) of its perturbation.
 
-    `sigmas` (3,) are those of the lever arm's x, y, z, or of the rotation about the vehicle's axes.
-    `held` (3,) are coordinates that nothing tells and that change nothing else: `cov` has
-    `HELD_M` of them.
+    `sigmas` (p,) are those of the lever arm's x, y, z, of the rotation about the vehicle's axes, or
+    of a time. `held` are coordinates of the lever arm that nothing tells and that change nothing
+    else: `cov` has `HELD_M` of them; empty: none.
     """
 
     mean: ParameterValue
     cov: Array
     sigmas: Array
-    held: tuple[bool, bool, bool] = (False, False, False)
+    held: tuple[bool, ...] = ()
 
 
 def motion_term(
@@ -180,13 +209,14 @@ def estimated_parameters(
         # What the drive knows is what the result knows beyond the prior.
         by_drive = np.maximum(1.0 / variance - prior.sigmas**-2.0, 0.0)
         limit = UNDETERMINED_RATIO * np.minimum(prior.sigmas, USUAL_SIGMAS[name])
-        determined = (by_drive > limit**-2.0) & ~np.array(prior.held)
+        determined = by_drive > limit**-2.0
+        if prior.held:
+            determined &= ~np.array(prior.held)
         # Of what nobody knows the linearised graph knows too much: the noise of the poses' tilt
         # looks like one that would tell the height of the antenna (`README.md`, section 17).
         unknown = ~determined & (prior.sigmas > USUAL_SIGMAS[name]) & (name == LEVER_ARM.name)
         sigma = np.where(unknown, prior.sigmas, np.sqrt(variance))
-        x, y, z = determined.tolist()
-        out[name] = VehicleParameter(np.asarray(value), sigma, (x, y, z))
+        out[name] = VehicleParameter(np.asarray(value), sigma, tuple(determined.tolist()))
     return out
 
 
@@ -223,15 +253,17 @@ PER_DRIVE = {SPEED_SCALE.name: "speed_scale", HEADING_YAW.name: "heading_yaw"}
 def _uncertain(trajectory: SmoothedTrajectory) -> dict[str, tuple[Array, Array]]:
     """Sigmas of the prior, and the offset from its mean, of each parameter that has one."""
     return {
-        p.parameter.name: (p.sigmas, np.zeros(p.parameter.size) if p.offset is None else p.offset)
+        p.parameter.name: (sigmas, np.zeros(p.parameter.size) if p.offset is None else p.offset)
         for p in trajectory.parameters
-        if p.sigmas is not None and p.parameter.name in KEYS
+        if (sigmas := p.graph_sigmas) is not None and p.parameter.name in KEYS
     }
 
 
 def _value(trajectory: SmoothedTrajectory, name: str) -> ParameterValue:
     if name == LEVER_ARM.name:
         return np.asarray(trajectory.data.lever_arm)
+    if name in CLOCKS:
+        return np.array([trajectory.data.late_ns.get(CLOCKS[name], 0) / NANOSECONDS_PER_SECOND])
     return trajectory.data.T_vehicle_imu.rotation()
 
 
@@ -242,7 +274,8 @@ def _in_tangents(trajectory: SmoothedTrajectory, joint: JointInformation) -> Joi
         return joint
     m = len(joint.T_map_vehicle)
     R_vehicle_imu = trajectory.data.T_vehicle_imu.rotation().matrix()
-    blocks = [R_vehicle_imu if n == rotation else np.eye(3) for n in joint.parameters]
+    sizes = {name: tangent_size(_value(trajectory, name)) for name in joint.parameters}
+    blocks = [R_vehicle_imu if n == rotation else np.eye(k) for n, k in sizes.items()]
     turn = np.asarray(block_diag(*blocks))
     information, gradient = joint.information.copy(), joint.gradient.copy()
     information[:, POSE * m :] = information[:, POSE * m :] @ turn
@@ -271,7 +304,8 @@ def _without_height(joint: JointInformation) -> JointInformation:
     where the antenna is, 20 m away.
     """
     m = len(joint.T_map_vehicle)
-    z = POSE * m + 3 * joint.parameters.index(LEVER_ARM.name) + 2
+    assert joint.parameters[0] == LEVER_ARM.name  # as in `KEYS`
+    z = POSE * m + 2
     # The fixes stay: a vehicle whose antenna is higher is lower.
     follow = np.eye(len(joint.gradient))
     follow[z, z] = 0.0

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field, model_validator
 
-from caliv_graph.config.sections import Place, Positive, Section, Triple
+from caliv_graph.config.sections import NonNegative, Place, Positive, Section, Triple
 from caliv_graph.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -80,6 +80,11 @@ class ImuConfig(Section):
         description="degrees, sigma of the rotation of T_vehicle_imu about each vehicle axis; "
         "absent: 0.1, and none where T_vehicle_imu is absent or the identity",
     )
+    time_offset_sigma_s: NonNegative = Field(
+        0.005,
+        description="seconds, sigma of its stamps less the true times, in the clock of the LiDARs; "
+        "0: exact",
+    )
     gravity_m_s2: Positive | None = Field(
         None, description="m/s^2, local gravity; absent: by latitude and altitude"
     )
@@ -120,6 +125,11 @@ class GnssConfig(Section):
         None,
         description="metres, sigma of the lever arm per axis; absent: 0.01, 2 where it is unknown, "
         "and none where it is exactly zero",
+    )
+    time_offset_sigma_s: NonNegative = Field(
+        0.02,
+        description="seconds, sigma of the stamps of the fixes less the true times, in the clock "
+        "of the LiDARs; 0: exact",
     )
 
     @model_validator(mode="after")

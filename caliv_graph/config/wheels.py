@@ -43,6 +43,11 @@ class WheelsConfig(Section):
         description="1 sigma of the scale of the speeds, measured over true, less one; absent: "
         "0.02, exact beside an IMU where lateral velocities are measured, too; 0: exact",
     )
+    time_offset_sigma_s: NonNegative = Field(
+        0.01,
+        description="seconds, sigma of the stamps of the speeds less the true times, in the clock "
+        "of the LiDARs, where there is no IMU; 0: exact",
+    )
 
     def rotation_sigmas_rad(self) -> tuple[float, float, float]:
         """Sigmas of the rotation of T_vehicle_wheels about the vehicle's axes, radians."""

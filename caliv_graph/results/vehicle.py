@@ -7,7 +7,7 @@ from collections.abc import Sized
 import numpy as np
 from pydantic import Field, StrictBool, model_validator
 
-from caliv_graph.products import TURNS, VehicleParameter
+from caliv_graph.products import TIME_OFFSETS, TURNS, VehicleParameter
 from caliv_graph.results.fields import Finite, Part, Sigma, Text
 
 
@@ -57,29 +57,36 @@ class _TurnPart(_MeasuredPart):
     sigma_deg: tuple[Sigma, Sigma, Sigma]
 
 
+class _ClockPart(Part):
+    value: tuple[Finite]
+    sigma: tuple[Sigma]
+    determined: tuple[StrictBool]
+    limits: tuple[Text, ...] = ()
+
+
 class VehiclePart(Part):
-    """What was measured by hand on the vehicle, as it was estimated."""
+    """What was measured by hand on the vehicle, and clocks of its sensors, as estimated."""
 
     lever_arm: _ArmPart | None = None
     imu_rotation: _TurnPart | None = None
     wheels_rotation: _TurnPart | None = None
     speed_scale: _ScalesPart | None = None
     heading_yaw: _AnglesPart | None = None
+    gnss_time_offset: _ClockPart | None = None
+    imu_time_offset: _ClockPart | None = None
+    twist_time_offset: _ClockPart | None = None
 
     def parameters(self) -> dict[str, VehicleParameter]:
-        """In metres and radians."""
+        """In metres, seconds and radians."""
         out = {}
-        if self.lever_arm is not None:
-            arm = self.lever_arm
-            value, sigma = np.array(arm.value), np.array(arm.sigma)
-            out["lever_arm"] = VehicleParameter(value, sigma, arm.determined, arm.limits)
         for name in TURNS:
             turn: _TurnPart | _AnglesPart | None = getattr(self, name)
             if turn is not None:
                 value, sigma = np.radians(turn.value_deg), np.radians(turn.sigma_deg)
                 out[name] = VehicleParameter(value, sigma, turn.determined, turn.limits)
-        if self.speed_scale is not None:
-            scale = self.speed_scale
-            value, sigma = np.array(scale.value), np.array(scale.sigma)
-            out["speed_scale"] = VehicleParameter(value, sigma, scale.determined, scale.limits)
-        return out
+        for name in ("lever_arm", "speed_scale", *TIME_OFFSETS):
+            found: _ArmPart | _ScalesPart | _ClockPart | None = getattr(self, name)
+            if found is not None:
+                value, sigma = np.array(found.value), np.array(found.sigma)
+                out[name] = VehicleParameter(value, sigma, found.determined, found.limits)
+        return {name: out[name] for name in type(self).model_fields if name in out}

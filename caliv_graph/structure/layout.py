@@ -58,7 +58,7 @@ class State:
     Attributes:
         R_map_vehicle: (M, 3, 3).
         t_map_vehicle: (M, 3) metres.
-        moved: (6 M + 3 k,) where poses and parameters of the vehicle are from the pose prior, T0 of
+        moved: (6 M + p,) where poses and parameters of the vehicle are from the pose prior, T0 of
             a pose: `T0^-1 T` in `chart`; with the errors of the rates, 6 more.
         T_vehicle_lidar: n poses.
         offsets_s: (n,) time offsets; zero where they are not free.

@@ -18,25 +18,25 @@ POSES_TOGETHER = 32
 
 @dataclass(frozen=True)
 class PosePrior:
-    """What the motion data of one drive say of m poses and of k parameters of the vehicle.
+    """What the motion data of one drive say of m poses and of parameters of the vehicle.
 
     Minus the log-likelihood is `d^T information d / 2 - gradient^T d`. d are coordinates of the
-    poses (`chart`; rotation then translation, rad and m), then of the parameters, three each:
-    metres of the lever arm; right perturbation of R_vehicle_imu; and, where points were moved by
-    the rates of the trajectory, of the errors of these (6, rad/s and m/s). Heave of the body, a
+    poses (`chart`; rotation then translation, rad and m), then p of the parameters: metres of the
+    lever arm, right perturbation of R_vehicle_imu, seconds of a clock; and, where points were moved
+    by the rates of the trajectory, of the errors of these (6, rad/s and m/s). Heave of the body, a
     sigma of its own at each pose, is part of the poses; the priors of the parameters are apart.
 
     Attributes:
         stamps_ns: (m,) of the poses, strictly increasing.
         T_map_vehicle: m poses at which d is zero, the drive's map.
         parameters: name of the input (`gnss.lever_arm`, `imu.T_vehicle_imu`) -> the value at which
-            d is zero: (3,) metres, or R_vehicle_imu. Empty: none is uncertain, or it was given
-            poses.
-        information: (6 m + 3 k, 6 m + 3 k), positive definite with `parameter_information` added;
-            with rates 6 more.
-        gradient: (6 m + 3 k,), or 6 more.
-        parameter_information: (3 k, 3 k) of the priors of the parameters, one for all drives.
-        parameter_offset: (3 k,) the present values less the means of these priors: the priors add
+            d is zero: (3,) metres, R_vehicle_imu, or (1,) seconds. Empty: none is uncertain, or it
+            was given poses.
+        information: (6 m + p, 6 m + p), positive definite with `parameter_information` added; with
+            rates 6 more.
+        gradient: (6 m + p,), or 6 more.
+        parameter_information: (p, p) of the priors of the parameters, one for all drives.
+        parameter_offset: (p,) the present values less the means of these priors: the priors add
             `parameter_information` and `-parameter_information parameter_offset`.
         chart: of the poses.
     """

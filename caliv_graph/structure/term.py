@@ -39,6 +39,7 @@ from caliv_graph.structure.thickness import (
 )
 from caliv_graph.structure.turns import turn_sigmas
 from caliv_graph.structure.views import views_of
+from caliv_graph.trajectory.factors import tangent_size
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import (
     GivenTrajectory,
@@ -351,19 +352,20 @@ def _parameters(found: Solved) -> dict[str, Array | gtsam.Rot3]:
     out: dict[str, Array | gtsam.Rot3] = {}
     at = 6 * found.layout.poses
     for name, value in found.problem.prior.parameters.items():
-        d = found.state.moved[at : at + 3]
-        at += 3
+        d = found.state.moved[at : at + tangent_size(value)]
+        at += len(d)
         out[name] = value.retract(d) if isinstance(value, gtsam.Rot3) else value + d
     return out
 
 
 def _parameters_by_now(found: Solved) -> Array:
-    """(3 k, 3 k) derivative of where the parameters are from their prior by right perturbations."""
+    """(p, p) derivative of where the parameters are from their prior by right perturbations."""
     at, blocks = 6 * found.layout.poses, [np.zeros((0, 0))]
-    for i, value in enumerate(found.problem.prior.parameters.values()):
-        moved = found.state.moved[at + 3 * i : at + 3 * i + 3]
+    for value in found.problem.prior.parameters.values():
+        moved = found.state.moved[at : at + tangent_size(value)]
+        at += len(moved)
         turns = isinstance(value, gtsam.Rot3)
-        blocks.append(gtsam.Rot3.LogmapDerivative(moved) if turns else np.eye(3))
+        blocks.append(gtsam.Rot3.LogmapDerivative(moved) if turns else np.eye(len(moved)))
     return np.asarray(scipy.linalg.block_diag(*blocks), np.float64)
 
 

@@ -151,14 +151,21 @@ def directions_of(
 
 
 def directions_at_nodes(
-    stamps_ns: IntArray, direction_imu: Array, nodes_ns: IntArray, dead: DeadReckoning
+    stamps_ns: IntArray,
+    direction_imu: Array,
+    nodes_ns: IntArray,
+    dead: DeadReckoning,
+    late_ns: int = 0,
 ) -> NodeDirections | None:
-    """Measurements within the trajectory, a direction (3,) of the IMU's frame carried to nodes."""
+    """Measurements within the trajectory, a direction (3,) of the IMU's frame carried to nodes.
+
+    `late_ns` are the stamps less the true times.
+    """
     own = np.flatnonzero((stamps_ns >= nodes_ns[0]) & (stamps_ns <= nodes_ns[-1]))
     if not len(own):
         return None
     node = nearest_node(nodes_ns, stamps_ns[own])
-    dR, _, _ = dead.between(nodes_ns[node], stamps_ns[own])
+    dR, _, _ = dead.between(nodes_ns[node], stamps_ns[own] - late_ns)
     return NodeDirections(node, own, dR @ direction_imu)
 
 

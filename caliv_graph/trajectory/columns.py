@@ -14,7 +14,7 @@ import numpy as np
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate, TrajectoryGraph, build_graph, from_values
 from caliv_graph.trajectory.factors import position_residuals, velocity_residuals
-from caliv_graph.trajectory.imu import DeadReckoning
+from caliv_graph.trajectory.imu import DeadReckoning, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.parameters import InputParameter
@@ -145,11 +145,13 @@ class _Residuals:
             return self._of_positions(moved)
         if kind == "velocity":
             return self._of_velocities(moved)
-        if kind == "imu" and moved.wheels is not None:
+        if kind == "imu" and moved.speed_scale != self._data.speed_scale:
             # Lengths of the motion's prior are in the unit of the wheels; nothing else moves it.
             by = np.ones(15)
             by[3:12] = moved.speed_scale / self._data.speed_scale
             return self._of_imu * by
+        if kind == "imu":
+            return self._of_inertial(moved)
         return self._of_graph(kind, moved)
 
     @cached_property
@@ -161,6 +163,26 @@ class _Residuals:
         graph = build_graph(*every, "none", frozenset({kind})).factors
         factors: list[Any] = [graph.at(i) for i in range(graph.size())]
         return np.array([factor.unwhitenedError(self._values) for factor in factors])
+
+    def _of_inertial(self, moved: SmootherInput) -> Array:
+        """Of the motion between nodes, as `CombinedImuFactor` has it; biases do not move.
+
+        Dead reckoning, all intervals at once: another integration than that of the factors, from
+        which the difference of two inputs is the same.
+        """
+        begin, end = self._nodes[:-1], self._nodes[1:]
+        dR, dv, dp = self._dead_of(moved).between(begin, end)
+        at, dt = self._at, ((end - begin) * 1e-9)[:, None]
+        R, v, p = at.R_map_imu[:-1], at.velocity_map, at.p_map_imu
+        back = np.swapaxes(at.R_map_imu[1:], 1, 2)
+        g = np.array([0.0, 0.0, -moved.gravity_m_s2])
+        miss_v = v[:-1] + g * dt + np.einsum("nij,nj->ni", R, dv) - v[1:]
+        miss_p = p[:-1] + v[:-1] * dt + 0.5 * g * dt**2 + np.einsum("nij,nj->ni", R, dp) - p[1:]
+        out = np.zeros((len(dt), 15))
+        out[:, :3] = log_so3(back @ R @ dR)
+        out[:, 3:6] = np.einsum("nij,nj->ni", back, miss_p)
+        out[:, 6:9] = np.einsum("nij,nj->ni", back, miss_v)
+        return out
 
     @cached_property
     def _dead(self) -> DeadReckoning:

@@ -40,6 +40,11 @@ MAX_TILT_DISAGREEMENT_RAD = math.radians(20.0)
 accelerations average to a few degrees; a wrong axis convention is 90 or 180."""
 
 
+IMU_CLOCK, GNSS_CLOCK = "imu", "gnss"
+"""Clocks of the sensors of the motion. Without an IMU the first is that of the wheels, which stand
+in for it; directions by antennas have the second."""
+
+
 @dataclass(frozen=True)
 class SmootherInput:
     """The sensor data of one drive, checked.
@@ -69,6 +74,8 @@ class SmootherInput:
         baselines: the same as vectors between two antennas.
         heading_yaw: direction of that baseline in the vehicle frame, to the left of x, radians.
         second_arm: (3,) the second antenna in the vehicle frame, metres.
+        late_ns: sensor (`IMU_CLOCK`, `GNSS_CLOCK`) -> stamps less true times in the clock of the
+            LiDARs; absent: 0. Stamps of `inertial` are free of it, all others as they were read.
     """
 
     name: str
@@ -91,6 +98,7 @@ class SmootherInput:
     baselines: Baselines | None = None
     heading_yaw: float = 0.0
     second_arm: Array = field(default_factory=lambda: np.zeros(3))
+    late_ns: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def heading_imu(self) -> Array:

@@ -100,11 +100,17 @@ def _weighted_mean(group: IntArray, values: Array, cov: Array) -> tuple[IntArray
 
 
 def orientations_at_nodes(
-    imu: ImuSamples, cov: Array, nodes_ns: IntArray, dead: DeadReckoning, noise: ImuNoise
+    imu: ImuSamples,
+    cov: Array,
+    nodes_ns: IntArray,
+    dead: DeadReckoning,
+    noise: ImuNoise,
+    late_ns: int = 0,
 ) -> NodeOrientations | None:
     """Averages the IMU's orientations around each node; None if there are none.
 
-    `cov` (n, 3, 3) rad^2 is that of each message, `dead` the IMU without bias.
+    `cov` (n, 3, 3) rad^2 is that of each message, `dead` the IMU without bias, `late_ns` the stamps
+    less the true times.
     """
     if imu.orientation_xyzw is None:
         return None
@@ -119,7 +125,7 @@ def orientations_at_nodes(
     some = np.unique(starts // SAMPLES_AT_A_TIME, return_index=True)[1]
     cuts = [*starts[some].tolist(), len(samples)]
     parts = [
-        _oriented(imu, cov, nodes_ns, dead, noise, samples[a:b], node[a:b])
+        _oriented(imu, cov, nodes_ns, dead, noise, samples[a:b], node[a:b], late_ns)
         for a, b in itertools.pairwise(cuts)
     ]
     return NodeOrientations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
@@ -133,10 +139,11 @@ def _oriented(
     noise: ImuNoise,
     samples: IntArray,
     node: IntArray,
+    late_ns: int,
 ) -> tuple[IntArray, Array, Array]:
     """`NodeOrientations` of some samples (m,) that carry one; `node` (m,) is theirs."""
     assert imu.orientation_xyzw is not None
-    stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[samples]
+    stamps = np.asarray(imu.stamps_ns, dtype=np.int64)[samples] - late_ns
     R = rotations_of(imu.orientation_xyzw[samples])
     at_node = nodes_ns[node]
     dR, _, _ = dead.between(stamps, at_node)
@@ -185,17 +192,21 @@ def velocities_at_nodes(
     noise: ImuNoise,
     T_twist_imu: gtsam.Pose3,
     scale: float = 1.0,
+    late_ns: int = 0,
 ) -> NodeVelocities | None:
     """Averages the velocities around each node; None if there are none.
 
     They are those of the origin of the twist's frame, mostly the vehicle's; `scale` is measured
-    over true ones. The lever to the IMU enters with the gyroscope's rate and its noise.
+    over true ones, `late_ns` the stamps less the true times. The lever to the IMU enters with the
+    gyroscope's rate and its noise.
     """
     usable = np.isfinite(twist.velocity).all(axis=1)
     usable &= (twist.stamps_ns >= nodes_ns[0]) & (twist.stamps_ns <= nodes_ns[-1])
     if not usable.any():
         return None
     stamps = np.asarray(twist.stamps_ns, dtype=np.int64)[usable]
+    node = nearest_node(nodes_ns, stamps)
+    stamps = stamps - late_ns
     T_imu_twist = T_twist_imu.inverse()
     R_imu_twist = T_imu_twist.rotation().matrix()
     arm = T_imu_twist.translation()
@@ -205,7 +216,6 @@ def velocities_at_nodes(
     arm_cross = np.cross(np.eye(3), arm)
     arm_cov = arm_cross.T @ (noise.gyro_density / sample_s) @ arm_cross
     cov_imu = R_imu_twist @ cov[usable] @ R_imu_twist.T + arm_cov
-    node = nearest_node(nodes_ns, stamps)
     at_node = nodes_ns[node]
     dR, dv, _ = dead.between(at_node, stamps)
     delay_s = (stamps - at_node) * 1e-9
@@ -217,11 +227,16 @@ def velocities_at_nodes(
 
 
 def positions_at_nodes(
-    positions: Positions, nodes_ns: IntArray, dead: DeadReckoning, arm_imu: Array
+    positions: Positions,
+    nodes_ns: IntArray,
+    dead: DeadReckoning,
+    arm_imu: Array,
+    late_ns: int = 0,
 ) -> NodePositions | None:
     """Fixes within the trajectory and their nodes; None if there are none.
 
-    `dead` is the IMU without bias, `arm_imu` (3,) the antenna in the imu frame, metres.
+    `dead` is the IMU without bias, `arm_imu` (3,) the antenna in the imu frame, metres, `late_ns`
+    the stamps less the true times.
     """
     stamps = positions.stamps_ns
     fixes = np.flatnonzero((stamps >= nodes_ns[0]) & (stamps <= nodes_ns[-1]))
@@ -229,7 +244,8 @@ def positions_at_nodes(
         return None
     node = nearest_node(nodes_ns, stamps[fixes])
     at_node = nodes_ns[node]
-    dR, _, dp = dead.between(at_node, stamps[fixes])
-    delay_s = np.asarray((stamps[fixes] - at_node) * 1e-9)
+    taken = stamps[fixes] - late_ns
+    dR, _, dp = dead.between(at_node, taken)
+    delay_s = np.asarray((taken - at_node) * 1e-9)
     position, cov = positions.position_map[fixes], positions.cov_map[fixes]
     return NodePositions(node, fixes, position, dp + dR @ arm_imu, delay_s, cov)

@@ -11,7 +11,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
 from caliv_graph.trajectory.antennas import NodeDirections, directions_at_nodes
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial
-from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK, SmootherInput
 from caliv_graph.trajectory.measurements import (
     NodeOrientations,
     NodePositions,
@@ -78,13 +78,16 @@ def carry_to_nodes(
 ) -> NodeMeasurements:
     """Carries the measurements of some kinds to their nearest nodes; `dead`: IMU without bias."""
     positions = orientations = velocities = None
+    gnss_late, imu_late = (data.late_ns.get(clock, 0) for clock in (GNSS_CLOCK, IMU_CLOCK))
     if data.positions is not None and "gnss" in kinds:
-        positions = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)
+        positions = positions_at_nodes(data.positions, nodes, dead, data.arm_imu, gnss_late)
     if data.orientation and "orientation" in kinds:
         assert data.motion.imu is not None
         cov, _ = orientation_covariances(data.motion.imu, data.config)
         cov = cov * data.scales.get("orientation", 1.0) ** 2
-        orientations = orientations_at_nodes(data.motion.imu, cov, nodes, dead, data.noise)
+        orientations = orientations_at_nodes(
+            data.motion.imu, cov, nodes, dead, data.noise, imu_late
+        )
     if data.motion.twist is not None and "velocity" in kinds:
         velocities = velocities_at_nodes(
             data.motion.twist,
@@ -94,12 +97,17 @@ def carry_to_nodes(
             data.noise,
             data.T_vehicle_twist.between(data.T_vehicle_imu),
             data.speed_scale,
+            0 if data.wheels is None else imu_late,
         )
     headings = baselines = None
     if data.headings is not None and "heading" in kinds:
-        headings = directions_at_nodes(data.headings.stamps_ns, data.heading_imu, nodes, dead)
+        headings = directions_at_nodes(
+            data.headings.stamps_ns, data.heading_imu, nodes, dead, gnss_late
+        )
     if data.baselines is not None and "baseline" in kinds:
-        baselines = directions_at_nodes(data.baselines.stamps_ns, data.baseline_imu, nodes, dead)
+        baselines = directions_at_nodes(
+            data.baselines.stamps_ns, data.baseline_imu, nodes, dead, gnss_late
+        )
     return NodeMeasurements(positions, orientations, velocities, headings, baselines)
 
 

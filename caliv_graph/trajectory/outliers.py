@@ -12,7 +12,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate
 from caliv_graph.trajectory.inputs import SmootherInput
-from caliv_graph.trajectory.measurements import positions_at_nodes
+from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.solve import ERROR_TOLERANCE, ROUGH_TOLERANCE, solve
 from caliv_graph.trajectory.states import States, without_bias
 
@@ -143,7 +143,7 @@ def _squared_residuals(data: SmootherInput, nodes: IntArray, states: States) -> 
     """(k,) squared whitened residual of each fix at an estimate; 0 outside the nodes' span."""
     assert data.positions is not None
     dead = without_bias(data.inertial, nodes, states)
-    carried = positions_at_nodes(data.positions, nodes, dead, data.arm_imu)
+    carried = carry_to_nodes(data, nodes, dead, frozenset({"gnss"})).positions
     out = np.zeros(len(data.positions.stamps_ns))
     if carried is None:
         return out

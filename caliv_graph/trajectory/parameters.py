@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array
-from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK, SmootherInput
 
 XYZ = ("x", "y", "z")
 
@@ -67,11 +68,19 @@ class UncertainParameter:
         parameter: what it is.
         sigmas: (p,) of its prior; None: without one it is held where nobody asks for it.
         offset: (p,) its present value less the prior's mean.
+        beside_lidars: (p,) the same as `sigmas` in the graph of a calibration, where LiDARs tell
+            more of it; None: `sigmas`.
     """
 
     parameter: InputParameter
     sigmas: Array | None = None
     offset: Array | None = None
+    beside_lidars: Array | None = None
+
+    @property
+    def graph_sigmas(self) -> Array | None:
+        """(p,) of its prior in the graph of a calibration."""
+        return self.sigmas if self.beside_lidars is None else self.beside_lidars
 
 
 def _arm_moved(data: SmootherInput, d: Array) -> SmootherInput:
@@ -152,6 +161,47 @@ SPEED_POINT = InputParameter(
 """Where in the vehicle frame wheels measure the speed, beside an IMU (`README.md`, section 15)."""
 
 
+def _gnss_late(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, late_ns=_later(data, GNSS_CLOCK, d))
+
+
+def _imu_late(data: SmootherInput, d: Array) -> SmootherInput:
+    late = _later(data, IMU_CLOCK, d)
+    # The ends of gaps are nodes, which stay where they are.
+    by_ns = late[IMU_CLOCK] - data.late_ns.get(IMU_CLOCK, 0)
+    inertial = replace(data.inertial, stamps_ns=data.inertial.stamps_ns - by_ns)
+    return replace(data, inertial=inertial, late_ns=late)
+
+
+def _later(data: SmootherInput, clock: str, d: Array) -> dict[str, int]:
+    by_ns = round(float(d[0]) * NANOSECONDS_PER_SECOND)
+    return {**data.late_ns, clock: data.late_ns.get(clock, 0) + by_ns}
+
+
+GNSS_TIME_OFFSET = InputParameter(
+    "gnss.time_offset",
+    ("value",),
+    "s",
+    np.full(1, 1e-3),
+    frozenset({"gnss", "heading", "baseline"}),
+    _gnss_late,
+)
+"""Stamps of the fixes less the true times, in the clock of the LiDARs (`README.md`, section 13)."""
+
+IMU_TIME_OFFSET = InputParameter(
+    "imu.time_offset",
+    ("value",),
+    "s",
+    np.full(1, 1e-3),
+    frozenset({"imu", "gnss", "orientation", "velocity", "heading", "baseline"}),
+    _imu_late,
+)
+"""The same of the IMU, its orientations with it. Nodes and their poses stay in the clock of the
+LiDARs."""
+
+WHEELS_TIME_OFFSET = replace(IMU_TIME_OFFSET, name="twist.time_offset")
+"""The same of wheels without an IMU, whose odometry stands in for it."""
+
 HEADING_YAW = InputParameter(
     "heading.yaw_deg", ("value",), "rad", np.full(1, 1e-3), frozenset({"heading"}), _heading_moved
 )
@@ -171,3 +221,8 @@ def speed_scale(data: SmootherInput) -> InputParameter:
 def mount_rotation(data: SmootherInput) -> InputParameter:
     """The rotation of `T_vehicle_imu` under the name that it has in the config."""
     return IMU_ROTATION if data.wheels is None else WHEELS_ROTATION
+
+
+def inertial_time_offset(data: SmootherInput) -> InputParameter:
+    """The clock of the IMU, or of the wheels that stand in for it."""
+    return IMU_TIME_OFFSET if data.wheels is None else WHEELS_TIME_OFFSET

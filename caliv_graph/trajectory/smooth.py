@@ -43,6 +43,7 @@ from caliv_graph.trajectory.uncertain import (
     settle,
     uncertain_parameters,
     vehicle_covariances,
+    with_late_clock,
 )
 from caliv_graph.trajectory.variances import estimated_scales
 
@@ -93,6 +94,9 @@ def smooth_trajectory(
     if parameters:
         kernel = data.config.robust.kernel
         settled = settle(data, nodes, robust.estimate, robust.dropped, kernel, parameters)
+        if late := with_late_clock(settled):
+            data, before = settled.data, settled.estimate
+            settled = settle(data, nodes, before, robust.dropped, kernel, late)
         robust = replace(robust, estimate=settled.estimate)  # one graph is enough
     linear = settled.estimate.graph.factors.linearize(settled.estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, settled.data, settled.estimate.states)

@@ -19,10 +19,12 @@ from caliv_graph.products import Array, ImuSamples
 from caliv_graph.trajectory.imu import interpolate, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.parameters import (
+    GNSS_TIME_OFFSET,
     HEADING_YAW,
     LEVER_ARM,
     SECOND_ARM,
     InputParameter,
+    inertial_time_offset,
     mount_rotation,
     speed_scale,
 )
@@ -41,9 +43,9 @@ linearised graph claims more than there is: at sigmas of 0.5 m it wandered by me
 ROTATION_RAD = math.radians(0.1)
 """The same of the IMU's rotation: a mount on a surface that was made for it."""
 
-GNSS_CLOCK_S = 5e-3
-"""The same of the stamps of the fixes: half the sample period of an IMU at 100 Hz; at 2 m/s it is
-the centimetre of `ARM_M`."""
+CLOCK_S = 5e-3
+"""The same of the stamps of a sensor, where the config says that they are exact: half the sample
+period of an IMU at 100 Hz; at 2 m/s it is the centimetre of `ARM_M`."""
 
 SENSOR_SCALE = 0.01
 """The same of the scales of gyroscope and accelerometer: data sheets of MEMS sensors state 0.1 to
@@ -55,9 +57,6 @@ stands are noise, by which the scale came out at 1.9 with a sigma of 0.2."""
 
 HEADING_RAD = math.radians(0.2)
 """The same of the heading of an orientation source, as `heading.FLOOR_RAD`."""
-
-_VELOCITY_NS = 50_000_000
-"""Half the time over which the antenna's velocity is taken."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,8 @@ def suspect_parameters(smoothed: SmoothedTrajectory) -> tuple[SuspectParameter, 
     data, out = smoothed.data, []
     if data.positions is not None:
         out.append(_known(smoothed, LEVER_ARM, ARM_M, ARM_KNOWN_M))
-        out.append(_plain(_gnss_clock(smoothed), GNSS_CLOCK_S, 1.0))
+        out.append(_known(smoothed, GNSS_TIME_OFFSET, CLOCK_S, 1.0))
+    out.append(_known(smoothed, inertial_time_offset(data), CLOCK_S, 1.0))
     if data.positions is not None or data.motion.twist is not None:
         out.append(_known(smoothed, mount_rotation(data), ROTATION_RAD, 0.5))
     if data.motion.twist is not None:
@@ -140,10 +140,11 @@ def _known(
     One that the user asked to be estimated has no right value: it is no suspect beyond its prior.
     """
     for p in smoothed.parameters:
-        if p.parameter.name == parameter.name and p.sigmas is not None:
+        sigmas = p.graph_sigmas
+        if p.parameter.name == parameter.name and sigmas is not None:
             offset = np.zeros(parameter.size) if p.offset is None else p.offset
-            wide = np.maximum(scale, 3.0 * p.sigmas)
-            return SuspectParameter(parameter, np.asarray(p.sigmas), wide, offset)
+            wide = np.maximum(scale, 3.0 * sigmas)
+            return SuspectParameter(parameter, sigmas, wide, offset)
     return _plain(parameter, allowance, scale)
 
 
@@ -152,31 +153,6 @@ def _plain(parameter: InputParameter, allowance: float, scale: float) -> Suspect
     return SuspectParameter(
         parameter, np.full(size, allowance), np.full(size, scale), np.zeros(size)
     )
-
-
-def _gnss_clock(smoothed: SmoothedTrajectory) -> InputParameter:
-    """Stamps of the fixes less their true times: a fix that is late was taken before.
-
-    It moves the fixes along the antenna's estimated path, so that each stays with its node.
-    """
-    assert smoothed.data.positions is not None
-    begin, end = smoothed.span_ns
-    stamps = smoothed.data.positions.stamps_ns
-    before = np.clip(stamps - _VELOCITY_NS, begin, end)
-    after = np.clip(stamps + _VELOCITY_NS, begin, end)
-    places = []
-    for at in (before, after):
-        R, t = smoothed.poses_at(at)
-        places.append(t + R @ smoothed.data.lever_arm)
-    seconds = np.maximum((after - before) * 1e-9, 1e-9)
-    velocity_map = (places[1] - places[0]) / seconds[:, None]
-
-    def moved(data: SmootherInput, d: Array) -> SmootherInput:
-        assert data.positions is not None
-        shifted = data.positions.position_map + d[0] * velocity_map
-        return replace(data, positions=replace(data.positions, position_map=shifted))
-
-    return _scalar("gnss.time_offset", "s", "gnss", moved)
 
 
 def _inertial_scales(smoothed: SmoothedTrajectory) -> tuple[InputParameter, InputParameter]:

@@ -22,6 +22,7 @@ from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import node_ordering
 from caliv_graph.trajectory.parameters import (
+    GNSS_TIME_OFFSET,
     HEADING_YAW,
     IMU_ROTATION,
     LEVER_ARM,
@@ -31,6 +32,7 @@ from caliv_graph.trajectory.parameters import (
     SPEED_SCALE,
     WHEELS_ROTATION,
     UncertainParameter,
+    inertial_time_offset,
     mount_rotation,
     speed_scale,
 )
@@ -48,6 +50,16 @@ SPEED_POINT_SIGMAS = (0.1, 0.5)
 """1 sigma of it, metres, beside the vehicle's x axis. The body pitches about a point half a metre
 above the axle on which the wheels roll; wheels of one side, or of other radii, measure a part of
 the turn."""
+
+SYNCHRONISED_S = 1e-4
+"""1 sigma of a synchronised clock: PPS and PTP are below, NTP on a local network is about there.
+Motion data alone hardly tell clocks: free, they move the trajectory along itself by a centimetre
+and turn it by a milliradian. A calibration, whose LiDARs tell more, frees them
+(`calibration/clock_prior.py`)."""
+
+LATE_SIGMAS = 4.0
+"""Of what the motion data alone say of that clock, from which it is late: one sound drive in 16,000
+is that far off."""
 
 WIDE_SIGMAS = {
     LEVER_ARM.name: 0.05,
@@ -88,6 +100,7 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
         out.append(UncertainParameter(LEVER_ARM, np.full(3, arm), np.zeros(3)))
     if data.rotation_sigmas is not None:
         out.append(UncertainParameter(mount_rotation(data), data.rotation_sigmas, np.zeros(3)))
+    out += _clocks(data)
     wheels = data.config.wheels
     if data.wheels is not None:
         slope = np.full(2, np.radians(wheels.slope_sigma_deg))
@@ -105,6 +118,23 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
         arms = np.full(3, heading.lever_arm_sigma)
         out.append(UncertainParameter(SECOND_ARM, arms, np.zeros(3)))
     return tuple(out)
+
+
+def _clocks(data: SmootherInput) -> list[UncertainParameter]:
+    """The time offsets that have a sigma; of the IMU none where those of LiDARs are free."""
+    config, sigmas = data.config, []
+    if not config.solve.time_offset:
+        inertial = config.imu if data.wheels is None else config.wheels
+        sigmas.append((inertial_time_offset(data), inertial.time_offset_sigma_s))
+    if data.positions is not None:
+        sigmas.append((GNSS_TIME_OFFSET, config.gnss.time_offset_sigma_s))
+    return [
+        UncertainParameter(
+            parameter, np.full(1, min(sigma_s, SYNCHRONISED_S)), np.zeros(1), np.full(1, sigma_s)
+        )
+        for parameter, sigma_s in sigmas
+        if sigma_s
+    ]
 
 
 def are_wide(parameters: Sequence[UncertainParameter]) -> bool:
@@ -170,6 +200,27 @@ def settle(
         del estimate, linear, tree, solution, root  # megabytes per minute of drive
         estimate = solve(data, nodes, states, dropped, kernel, tolerance)
     return Settled(data, estimate, parameters, columns, cov)
+
+
+def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
+    """The parameters, the clock of the fixes free where the motion data say that it is late.
+
+    None: they do not. A trajectory under a clock that is off by 50 ms is bent by as much as LiDARs
+    see of it.
+    """
+    variances, out, first = np.diagonal(settled.cov), [], 0
+    for p in settled.parameters:
+        at, first = first, first + p.parameter.size
+        if p.parameter is GNSS_TIME_OFFSET:
+            assert p.sigmas is not None
+            assert p.offset is not None
+            told = 1.0 / variances[at] - p.sigmas[0] ** -2.0
+            # The offset is what the data alone say, times their part of all information.
+            pull = p.offset[0] / variances[at]
+            if pull**2 > LATE_SIGMAS**2 * max(told, 0.0) > 0.0:
+                p = replace(p, sigmas=p.beside_lidars)
+        out.append(p)
+    return tuple(out) if any(p.sigmas is p.beside_lidars for p in out) else None
 
 
 def moved(

@@ -33,6 +33,7 @@ from caliv_graph.trajectory.correlated import (
 )
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.parameters import (
+    GNSS_TIME_OFFSET,
     HEADING_YAW,
     LEVER_ARM,
     SECOND_ARM,
@@ -132,7 +133,7 @@ def estimated_scales(
     values = to_values(part, data)
     # Free, whatever sigma they have: a lever arm that was typed wrong is no noise.
     rotation = mount_rotation(data)
-    typed = [rotation] if data.positions is None else [LEVER_ARM, rotation]
+    typed = [rotation] if data.positions is None else [LEVER_ARM, rotation, GNSS_TIME_OFFSET]
     if data.motion.twist is not None and data.speed_scale_sigma:
         typed.append(speed_scale(data))
     typed += [SPEED_POINT] if data.speed_alone else []

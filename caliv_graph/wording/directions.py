@@ -31,9 +31,12 @@ PARAMETER_KEYS = {
     "imu_rotation": "imu.T_vehicle_imu",
     "wheels_rotation": "wheels.T_vehicle_wheels",
     "heading_yaw": "heading.yaw_deg",
+    "gnss_time_offset": "gnss.time_offset",
+    "imu_time_offset": "imu.time_offset",
+    "twist_time_offset": "twist.time_offset",
     "speed_scale": "scale of the speeds in topics.twist",
 }
-"""What was measured by hand on the vehicle -> its key in the config."""
+"""What was measured on the vehicle, or is the clock of a sensor -> what messages call it."""
 
 
 def same_as_parameters(

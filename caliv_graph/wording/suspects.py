@@ -132,7 +132,18 @@ def vector(
 
 _REMEDIES = {
     "gnss.lever_arm": "Measure the antenna in the vehicle frame again, or set gnss.lever_arm: null",
-    "gnss.time_offset": "Check the clock of the GNSS receiver against that of the IMU",
+    "gnss.time_offset": (
+        "Check the clock of the GNSS receiver against those of IMU and LiDARs, or set "
+        "gnss.time_offset_sigma_s to as much"
+    ),
+    "imu.time_offset": (
+        "Check the clock of the IMU against those of GNSS and LiDARs, or set "
+        "imu.time_offset_sigma_s to as much"
+    ),
+    "twist.time_offset": (
+        "Check the clock of the velocities against those of GNSS and LiDARs, or set "
+        "wheels.time_offset_sigma_s to as much"
+    ),
     "imu.T_vehicle_imu": "Check imu.T_vehicle_imu, or set its rpy_deg: null",
     "heading.yaw_deg": "Check heading.yaw_deg, where the baseline of the antennas points",
     "heading.lever_arm": "Measure the second antenna in the vehicle frame again",

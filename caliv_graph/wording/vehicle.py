@@ -1,10 +1,10 @@
-"""What was measured by hand on the vehicle, as a solve estimated it."""
+"""What was measured on the vehicle, and clocks of its sensors, as a solve estimated them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from caliv_graph.products import TURNS, VehicleParameter
+from caliv_graph.products import TIME_OFFSETS, TURNS, VehicleParameter
 from caliv_graph.wording.directions import PARAMETER_KEYS
 
 
@@ -16,6 +16,10 @@ def vehicle_text(name: str, found: VehicleParameter) -> str:
     if name == "heading_yaw":
         turns, sigmas = (_numbers(np.degrees(v), 3) for v in (found.value, found.sigma))
         return f"{PARAMETER_KEYS[name]}: ({turns}), sigma ({sigmas}) degrees, one per drive"
+    if name in TIME_OFFSETS:
+        value_ms, sigma_ms = 1e3 * float(found.value[0]), 1e3 * float(found.sigma[0])
+        text = f"{PARAMETER_KEYS[name]}: {value_ms:+.2f} ms, sigma {sigma_ms:.2f} ms"
+        return f"{text}{_limits(found)}"
     turn = name in TURNS
     unit, digits = ("degrees", 2) if turn else ("m", 3)
     value, sigma = (
@@ -33,9 +37,13 @@ def vehicle_text(name: str, found: VehicleParameter) -> str:
         f"{PARAMETER_KEYS[name]}: ({_numbers(value, digits)}) {unit}, sigma "
         f"({_numbers(sigma, digits + 1)}) {unit}; {drive}"
     )
+    return f"{text}{_limits(found)}"
+
+
+def _limits(found: VehicleParameter) -> str:
     if not found.limits:
-        return text
-    return f"{text}. Half or more of the variance of S2V {', '.join(found.limits)} comes from it"
+        return ""
+    return f". Half or more of the variance of S2V {', '.join(found.limits)} comes from it"
 
 
 def _numbers(values: np.typing.NDArray[np.float64], digits: int) -> str:

@@ -514,6 +514,8 @@ def test_what_was_measured_by_hand_is_written_and_read_back(tmp_path: Path) -> N
     yaw = VehicleParameter(np.radians([91.0]), np.radians([0.2]), (True,))
     measured = {"lever_arm": arm, "imu_rotation": turn, "wheels_rotation": turn}
     measured |= {"speed_scale": scales, "heading_yaw": yaw}
+    clock = VehicleParameter(np.array([0.0251]), np.array([3e-4]), (True,), ("x",))
+    measured |= {"gnss_time_offset": clock, "imu_time_offset": clock, "twist_time_offset": clock}
     calibration = replace(make_calibration(), vehicle=measured)
 
     write_calibration(calibration, tmp_path / "calibration.yaml")
@@ -525,7 +527,9 @@ def test_what_was_measured_by_hand_is_written_and_read_back(tmp_path: Path) -> N
     assert document["imu_rotation"]["sigma_deg"] == pytest.approx([0.1, 0.1, 0.2])
     assert document["speed_scale"]["value"] == [1.02, 1.019]
     assert document["heading_yaw"]["value_deg"] == pytest.approx([91.0])
+    assert document["imu_time_offset"]["value"] == [0.0251]
     found = read_calibration(tmp_path / "calibration.yaml").vehicle
+    assert list(found) == list(measured)
     for name, expected in calibration.vehicle.items():
         np.testing.assert_allclose(found[name].value, expected.value, atol=1e-12)
         np.testing.assert_allclose(found[name].sigma, expected.sigma, atol=1e-12)

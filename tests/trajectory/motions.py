@@ -195,17 +195,21 @@ def first_fix_map(motion: MotionData) -> Array:
 
 
 def config_for(sensors: Sensors, **sections: Mapping[str, object]) -> Config:
-    """A config that knows the extrinsics exactly, unless `sections` say otherwise."""
+    """A config that knows extrinsics and clocks exactly, unless `sections` say otherwise."""
     rpy = np.degrees(sensors.T_vehicle_imu.rotation().rpy())
     known: dict[str, object] = {} if not any(sensors.lever_arm) else {"lever_arm_sigma": 1e-7}
     same = sensors.T_vehicle_imu.equals(gtsam.Pose3(), 1e-9)
     turned: dict[str, object] = {} if same else {"rotation_sigma_deg": 1e-6}
     raw: dict[str, object] = {
         "lidars": {"front": {"topic": "/front", "initial": {"xyz": [2, 0, 2]}}},
-        "gnss": {"lever_arm": list(sensors.lever_arm), **known},
         **sections,
     }
+    clock = {"time_offset_sigma_s": 0.0}
+    arm = {"lever_arm": list(sensors.lever_arm), **known}
+    raw["gnss"] = {**clock, **sections.get("gnss", arm)}
+    raw["wheels"] = {**clock, **sections.get("wheels", {})}
     raw["imu"] = {
+        **clock,
         "T_vehicle_imu": {
             "xyz": sensors.T_vehicle_imu.translation().tolist(),
             "rpy_deg": rpy.tolist(),

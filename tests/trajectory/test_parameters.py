@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 import pytest
 
 from caliv_graph.config.model import Config
-from caliv_graph.products import Array
+from caliv_graph.products import Array, GnssFixes, ImuSamples
 from caliv_graph.trajectory.columns import whitening
-from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM, InputParameter
+from caliv_graph.trajectory.parameters import (
+    GNSS_TIME_OFFSET,
+    IMU_ROTATION,
+    IMU_TIME_OFFSET,
+    LEVER_ARM,
+    InputParameter,
+)
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.with_parameters import with_parameters
 from tests.trajectory.motions import Course, config_for, eight_drive, mounted_askew, record, stamps
+
+Samples = TypeVar("Samples", ImuSamples, GnssFixes)
 
 COURSE = Course(eight_drive(12.0), rough=1.0)
 SENSORS = replace(mounted_askew(), gnss_delay_s=0.033, twist_hz=50.0, twist_delay_s=0.017)
@@ -26,7 +34,16 @@ CONFIG = config_for(SENSORS, robust={"kernel": "none"})
 
 
 def smoothed_with(parameter: InputParameter, d: Array) -> SmoothedTrajectory:
-    """The drive again, with a parameter of the config moved by d."""
+    """The drive again, with a parameter of the config moved by d, or stamps that are earlier by d.
+
+    A sensor whose stamps are taken as late by d is one whose stamps are earlier by d.
+    """
+    if parameter is GNSS_TIME_OFFSET:
+        assert MOTION.gnss is not None
+        return smooth_trajectory(replace(MOTION, gnss=earlier(MOTION.gnss, d)), CONFIG, WANTED)
+    if parameter is IMU_TIME_OFFSET:
+        assert MOTION.imu is not None
+        return smooth_trajectory(replace(MOTION, imu=earlier(MOTION.imu, d)), CONFIG, WANTED)
     if parameter is LEVER_ARM:
         arm = np.array(CONFIG.gnss.lever_arm) + d
         return smooth_trajectory(MOTION, config_of({"gnss": {"lever_arm": tuple(arm)}}), WANTED)
@@ -34,6 +51,10 @@ def smoothed_with(parameter: InputParameter, d: Array) -> SmoothedTrajectory:
     rpy = gtsam.Rot3.Expmap(d).compose(T.rotation()).rpy()
     mounting = {"xyz": tuple(T.translation()), "rpy_deg": tuple(np.degrees(rpy))}
     return smooth_trajectory(MOTION, config_of({"imu": {"T_vehicle_imu": mounting}}), WANTED)
+
+
+def earlier(samples: Samples, d: Array) -> Samples:
+    return replace(samples, stamps_ns=samples.stamps_ns - round(1e9 * d[0]))
 
 
 def config_of(changes: dict[str, dict[str, object]]) -> Config:
@@ -62,8 +83,13 @@ def test_derivatives_are_whitened_as_the_residuals_are() -> None:
 
 @pytest.mark.parametrize(
     ("parameter", "d"),
-    [(LEVER_ARM, np.array([0.02, -0.03, 0.01])), (IMU_ROTATION, np.array([1.0, -2.0, 1.5]) * 1e-3)],
-    ids=["lever arm", "imu rotation"],
+    [
+        (LEVER_ARM, np.array([0.02, -0.03, 0.01])),
+        (IMU_ROTATION, np.array([1.0, -2.0, 1.5]) * 1e-3),
+        (GNSS_TIME_OFFSET, np.array([3e-3])),
+        (IMU_TIME_OFFSET, np.array([-2e-4])),
+    ],
+    ids=["lever arm", "imu rotation", "gnss clock", "imu clock"],
 )
 def test_the_joint_gaussian_predicts_what_a_moved_parameter_does(
     parameter: InputParameter, d: Array

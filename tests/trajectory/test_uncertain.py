@@ -94,6 +94,29 @@ def test_what_was_measured_roughly_is_in_the_covariance_of_every_pose() -> None:
     assert nees(motion, rough) < 12.0
 
 
+@pytest.mark.parametrize(("late_s", "sigma_s"), [(0.0, 1e-4), (0.08, 0.02)])
+def test_motion_data_free_a_clock_that_is_clearly_late(late_s: float, sigma_s: float) -> None:
+    motion = record(COURSE, SENSORS, 3)
+    assert motion.gnss is not None
+    stamps_ns = motion.gnss.stamps_ns + round(1e9 * late_s)
+    motion = replace(motion, gnss=replace(motion.gnss, stamps_ns=stamps_ns))
+    config = config_for(
+        SENSORS, gnss={"lever_arm": list(SENSORS.lever_arm), "time_offset_sigma_s": 0.02}
+    )
+
+    smoothed = smooth_trajectory(motion, config, WANTED)
+
+    clock = next(p for p in smoothed.parameters if p.parameter.name == "gnss.time_offset")
+    found, sigma = smoothed.data.late_ns["gnss"] * 1e-9, smoothed.sigmas_of("gnss.time_offset")
+    assert sigma is not None
+    # Under the prior of 20 ms that of 80 ms is short of it by (sigma / 20 ms)^2 of itself.
+    assert abs(found - late_s) < 3.0 * sigma[0] + late_s * (sigma[0] / 0.02) ** 2
+    assert sigma[0] < 8e-3
+    assert clock.sigmas == pytest.approx(sigma_s)
+    # The graph of a calibration has the wide prior in either case.
+    assert clock.graph_sigmas == pytest.approx(0.02)
+
+
 @pytest.mark.parametrize("rpy_deg", [(90.0, 3.0, 40.0), (0.0, 90.0, 20.0)], ids=str)
 def test_an_imu_on_its_side_is_found(rpy_deg: tuple[float, float, float]) -> None:
     R = gtsam.Rot3.RzRyRx(*np.radians(rpy_deg))

@@ -277,6 +277,11 @@ def test_a_measured_figure_comes_with_what_it_limits() -> None:
     assert vehicle_text("heading_yaw", yaw) == (
         "heading.yaw_deg: (91.200), sigma (0.050) degrees, one per drive"
     )
+    clock = VehicleParameter(np.array([0.0251]), np.array([3.1e-4]), (True,), ("x",))
+    assert vehicle_text("gnss_time_offset", clock) == (
+        "gnss.time_offset: +25.10 ms, sigma 0.31 ms. Half or more of the variance of S2V x comes "
+        "from it"
+    )
 
 
 # ------------------------------------------------------------------ walls instead of a target

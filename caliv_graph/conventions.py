@@ -87,7 +87,7 @@ def key_wheels_rotation() -> int:
 def key_sensor_offset(index: int) -> int:
     """Key of the time offset of a sensor of the motion, (1,) seconds, one for all drives.
 
-    0: GNSS, 1: IMU, 2: wheels.
+    0: GNSS, 1: IMU, 2: wheels, 3: given poses.
     """
     return int(gtsam.symbol("f", index))
 

@@ -633,7 +633,7 @@ class LinearisedGraph:
 TURNS = ("imu_rotation", "wheels_rotation", "heading_yaw")
 """Names of parameters of the vehicle that are rotations: radians here, degrees in files."""
 
-TIME_OFFSETS = ("gnss_time_offset", "imu_time_offset", "twist_time_offset")
+TIME_OFFSETS = ("gnss_time_offset", "imu_time_offset", "twist_time_offset", "pose_time_offset")
 """Names of those that are stamps of a sensor less the true times, in the clock of the LiDARs."""
 
 

@@ -1,4 +1,4 @@
-"""The prior of the clock of the GNSS: synchronised with another one, or late by anything.
+"""The prior of the clock of GNSS or given poses: synchronised with another one, or late.
 
 A Gaussian is the wrong prior of a clock. Most receivers stamp a fix with the time at which it was
 taken; some drivers stamp it when it arrives, tens of milliseconds later. A wide prior costs the
@@ -18,7 +18,7 @@ from caliv_graph.calibration.graph import motion_graph
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.calibration.solve import SolveState, covariance_of_mode
-from caliv_graph.calibration.vehicle_parameters import KEYS
+from caliv_graph.calibration.vehicle_parameters import KEYS, POSE_TIME_OFFSET
 from caliv_graph.trajectory.parameters import (
     GNSS_TIME_OFFSET,
     IMU_TIME_OFFSET,
@@ -32,32 +32,37 @@ as of one device for both; late by anything, one rig in five."""
 
 
 def has_clock(problem: Problem) -> bool:
-    """Whether the clock of the GNSS is a variable of a problem."""
-    return GNSS_TIME_OFFSET.name in problem.parameters
+    """Whether the clock of the GNSS or of given poses is a variable of a problem."""
+    return not problem.parameters.keys().isdisjoint((GNSS_TIME_OFFSET.name, POSE_TIME_OFFSET))
 
 
 def under_clock_prior(state: SolveState, reduced: Reduced, undetermined: int | None) -> SolveState:
-    """A solved graph with the mixture as the prior of the clock, to be solved again.
+    """A solved graph with the mixture as the prior of a clock, to be solved again.
 
     `reduced` is `state` at its solution, under the wide prior; `undetermined` as in `step_of_mode`.
     """
-    problem, name = state.problem, GNSS_TIME_OFFSET.name
+    problem = state.problem
     cov = covariance_of_mode(state, reduced, undetermined)
 
     def of(clock: str) -> Moments:
         value = state.values.atVector(KEYS[clock])
         return Moments(float(value[0]), float(reduced.covariance_of(KEYS[clock], cov)[0, 0]))
 
-    prior = problem.parameters[name]
-    synchronised = [(WITH_LIDARS, Moments(0.0, SYNCHRONISED_S**2))]
+    exact = Moments(0.0, SYNCHRONISED_S**2)
+    clocks = {POSE_TIME_OFFSET: [(WITH_LIDARS + WITH_IMU, exact)]}
+    clocks[GNSS_TIME_OFFSET.name] = [(WITH_LIDARS, exact)]
     for inertial in {IMU_TIME_OFFSET.name, WHEELS_TIME_OFFSET.name} & problem.parameters.keys():
         other = of(inertial)
         with_it = replace(other, variance=other.variance + SYNCHRONISED_S**2)
-        synchronised.append((WITH_IMU, with_it))
-    wide = Moments(float(np.asarray(prior.mean)[0]), float(prior.cov[0, 0]))
-    found = gaussian_prior(of(name), wide, synchronised)
-    narrow = replace(prior, mean=np.array([found.mean]), cov=np.array([[found.variance]]))
-    problem = replace(problem, parameters={**problem.parameters, name: narrow})
+        clocks[GNSS_TIME_OFFSET.name].append((WITH_IMU, with_it))
+    priors = dict(problem.parameters)
+    for name in clocks.keys() & priors.keys():
+        prior = priors[name]
+        wide = Moments(float(np.asarray(prior.mean)[0]), float(prior.cov[0, 0]))
+        found = gaussian_prior(of(name), wide, clocks[name])
+        cov_found = np.array([[found.variance]])
+        priors[name] = replace(prior, mean=np.array([found.mean]), cov=cov_found)
+    problem = replace(problem, parameters=priors)
     return replace(state, problem=problem, motion=motion_graph(problem))
 
 

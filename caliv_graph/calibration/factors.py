@@ -168,12 +168,14 @@ def given_pose_factor(
     sigma_rotation_rad: float,
     sigma_position_m: float,
     cov: Array | None = None,
+    late: tuple[int, Array] | None = None,
 ) -> gtsam.CustomFactor:
     """A given pose with a white error and the Gauss-Markov error b_i.
 
-    `r = [Log(R_given^T R) - b_rotation, t - t_given - b_position]`: rotation in vehicle axes,
-    position in map axes, since a position filter's error does not turn with the vehicle. The white
-    error has one sigma per kind of axis, or the covariance `cov` (6, 6).
+    `r = [Log(R_given^T R), t - t_given] - b - late g`: rotation in vehicle axes, position in map
+    axes, since a position filter's error does not turn with the vehicle. The white error has one
+    sigma per kind of axis, or the covariance `cov` (6, 6). `late` has the key of the time offset of
+    the given poses and g, (6,) rates of the vehicle in these axes, rad/s and m/s; None: it is zero.
     """
     R_given = T_map_vehicle.rotation()
     t_given = T_map_vehicle.translation()
@@ -182,6 +184,10 @@ def given_pose_factor(
     if cov is not None:
         noise = gtsam.noiseModel.Gaussian.Covariance(cov)
     by_error = -np.eye(6)
+    keys, rates = [key_pose, key_pose_error], np.zeros(6)
+    if late is not None:
+        keys.append(late[0])
+        rates = late[1]
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T = values.atPose3(key_pose)
@@ -193,9 +199,12 @@ def given_pose_factor(
             J[3:, 3:] = rotation.matrix()
             jacobians[0] = J
             jacobians[1] = by_error
-        return np.concatenate([w, T.translation() - t_given]) - values.atVector(key_pose_error)
+            if late is not None:
+                jacobians[2] = -rates[:, None]
+        r = np.concatenate([w, T.translation() - t_given]) - values.atVector(key_pose_error)
+        return r if late is None else r - rates * values.atVector(late[0])[0]
 
-    return gtsam.CustomFactor(noise, [key_pose, key_pose_error], error)
+    return gtsam.CustomFactor(noise, keys, error)
 
 
 def gauss_markov_factor(

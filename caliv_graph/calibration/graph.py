@@ -15,7 +15,7 @@ from caliv_graph.calibration.factors import (
     target_pose_factor,
 )
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.calibration.vehicle_parameters import KEYS
+from caliv_graph.calibration.vehicle_parameters import KEYS, POSE_TIME_OFFSET
 from caliv_graph.conventions import (
     key_extrinsic,
     key_pose_error,
@@ -134,7 +134,7 @@ def pose_graph(
     graph = merged(motion_graph(problem) if motion is None else motion)
     times, drives, given = problem.times_s(), problem.drives(), problem.given()
     stationary = pose_error_sigmas(noise)
-    stated = problem.stated()
+    stated, rates = problem.stated(), problem.given_rates
     for i in np.flatnonzero(given).tolist():
         T = problem.T_map_vehicle[i]
         graph.append(
@@ -146,6 +146,7 @@ def pose_graph(
                 noise.white_rotation_rad,
                 noise.white_position_m,
                 problem.stated_cov[i] if problem.stated_cov is not None and stated[i] else None,
+                None if rates is None else (KEYS[POSE_TIME_OFFSET], rates[i]),
             ),
         )
         if i == 0 or drives[i] != drives[i - 1]:

@@ -29,6 +29,7 @@ from caliv_graph.calibration.pose_effects import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.robust import own_blocks
+from caliv_graph.calibration.vehicle_parameters import KEYS, POSE_TIME_OFFSET
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.conventions import key_pose_error, key_vehicle
 from caliv_graph.products import Array, BoolArray, IntArray, PoseNoise
@@ -350,6 +351,8 @@ def squares_without_own_pose(
         turn = gtsam.Rot3.Logmap(given.rotation().between(X.rotation()))
         error = np.concatenate([turn, X.translation() - given.translation()])
         found[i] = error - values.atVector(key_pose_error(i))
+        if problem.given_rates is not None:
+            found[i] -= problem.given_rates[i] * values.atVector(KEYS[POSE_TIME_OFFSET])[0]
     r = residuals - np.einsum("jax,jx->ja", B, found[problem.cloud_pose])
     stated = stated_effect(problem, B, np.arange(problem.clouds))
     fitted = problem.given() & ~problem.stated()
@@ -367,7 +370,7 @@ def _stacked(
 ) -> tuple[Array, Array, Array]:
     """Residuals (6m,) of the chosen clouds, and what they depend on.
 
-    (6m, p) by extrinsics, targets and offsets; (m, 6, 6) by pose errors.
+    (6m, p) by extrinsics, targets, offsets and the clock of given poses; (m, 6, 6) by pose errors.
     """
     keys = (*problem.extrinsic_keys(), *problem.target_keys())
     columns = {key: 6 * i for i, key in enumerate(keys)}
@@ -381,6 +384,9 @@ def _stacked(
         for key, jacobian in zip(lines.keys[j], lines.jacobians[j], strict=True):
             if key in columns:
                 A[block, columns[key] : columns[key] + jacobian.shape[1]] = jacobian
+    if problem.given_rates is not None:
+        late = np.einsum("mij,mj->mi", B, problem.given_rates[problem.cloud_pose[chosen]])
+        A = np.column_stack([A, late.ravel()])
     return r, A, B
 
 

@@ -6,6 +6,7 @@ The same Gaussians as the graph's own factors of the poses (`graph.pose_graph`),
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -13,11 +14,14 @@ import scipy.linalg
 
 from caliv_graph.calibration.heave import with_heave
 from caliv_graph.calibration.vehicle_parameters import (
+    POSE_TIME_OFFSET,
     ParameterPrior,
     ParameterValue,
     chart_of,
     motion_gaussian,
     parameter_priors,
+    pose_clock_prior,
+    pose_clock_sigma,
 )
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
@@ -26,7 +30,7 @@ from caliv_graph.products import Array, IntArray, PoseNoise
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.trajectory.chain import inverse_of
 from caliv_graph.trajectory.noise import given_pose_covariances
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 
 WALK_RAD, WALK_M = 1e-3, 0.02
@@ -156,7 +160,28 @@ def _given(
     information[:, 3:] = np.einsum("iba,ibjk->iajk", R, information[:, 3:])
     information[..., 3:] = np.einsum("jba,ikjb->ikja", R, information[..., 3:])
     flat = information.reshape(6 * m, 6 * m)
-    return _on_poses(stamps, unstack(R, t), flat, np.zeros(6 * m))
+    prior = _on_poses(stamps, unstack(R, t), flat, np.zeros(6 * m))
+    clock_s = pose_clock_sigma(config)
+    return (
+        prior
+        if clock_s is None
+        else _with_clock(prior, twists_at(trajectory, stamps.tolist()), clock_s)
+    )
+
+
+def _with_clock(prior: PosePrior, twists: Array, sigma_s: float) -> PosePrior:
+    """The prior of given poses that are all late alike: they are moved along `twists` (m, 6)."""
+    late = twists.reshape(-1, 1)
+    coupling = -prior.information @ late
+    clock = pose_clock_prior(sigma_s)
+    return replace(
+        prior,
+        parameters={POSE_TIME_OFFSET: np.zeros(1)},
+        information=np.block([[prior.information, coupling], [coupling.T, -late.T @ coupling]]),
+        gradient=np.append(prior.gradient, 0.0),
+        parameter_information=np.asarray(np.linalg.inv(clock.cov), np.float64),
+        parameter_offset=np.zeros(1),
+    )
 
 
 def odometry_prior(trajectory: GivenTrajectory, stamps_ns: IntArray) -> PosePrior:

@@ -14,11 +14,15 @@ from caliv_graph.calibration.factors import STILL, CloudMotion
 from caliv_graph.calibration.heave import poses_with_heave
 from caliv_graph.calibration.vehicle_parameters import (
     KEYS,
+    POSE_TIME_OFFSET,
     MotionTerm,
     ParameterPrior,
     ParameterValue,
     motion_term,
     parameter_priors,
+    pose_clock_prior,
+    pose_clock_sigma,
+    rates_of_errors,
 )
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, configured_guess
 from caliv_graph.config.model import Config
@@ -80,6 +84,9 @@ class Problem:
             the other drives were given.
         motion_terms: the same with these parameters, of the drives whose poses depend on any.
         parameters: the prior of each of them, one for all drives.
+        given_rates: (n, 6) what a second of lateness is as an error of each given pose
+            (`factors.given_pose_factor`), zero of the others; None: their clock is exact, or no
+            pose was given.
         offsets: names of the LiDARs whose time offset is to be estimated.
         twists: (n, 6) velocity of the vehicle at each pose, a right perturbation per second; None
             if no offset is, and no points were moved.
@@ -114,6 +121,7 @@ class Problem:
     motion: Mapping[int, Array] = field(default_factory=dict)
     motion_terms: Mapping[int, MotionTerm] = field(default_factory=dict)
     parameters: Mapping[str, ParameterPrior] = field(default_factory=dict)
+    given_rates: Array | None = None
     offsets: frozenset[str] = frozenset()
     twists: Array | None = None
     accelerations: Array | None = None
@@ -231,8 +239,10 @@ class Problem:
         return tuple(key_offset(i) for i, name in enumerate(self.lidars) if name in self.offsets)
 
     def parameter_values(self) -> dict[int, ParameterValue]:
-        """Lever arm and rotation of the IMU by key: as the smoother of the first drive found."""
+        """Parameters by key: as the smoother of the first drive found, that of given poses zero."""
         out: dict[int, ParameterValue] = {}
+        if self.given_rates is not None:
+            out[KEYS[POSE_TIME_OFFSET]] = np.zeros(1)
         for term in self.motion_terms.values():
             for name, value in term.values.items():
                 out.setdefault(KEYS[name], value)
@@ -360,6 +370,10 @@ def pose_problem(
         if isinstance(trajectory, SmoothedTrajectory) and d in origins
     }
     of_drive = {d: [stamp for drive, stamp in poses if drive == d] for d in smoothed}
+    clock_s, parameters = pose_clock_sigma(config), parameter_priors(list(smoothed.values()))
+    rates = None if clock_s is None else _given_rates(trajectories, poses)
+    if clock_s is not None and rates is not None:
+        parameters[POSE_TIME_OFFSET] = pose_clock_prior(clock_s)
     terms = {d: motion_term(t, of_drive[d], heave_m) for d, t in smoothed.items()}
     of_pose = dict(zip(poses, T_map_vehicle, strict=True))
     return Problem(
@@ -382,7 +396,8 @@ def pose_problem(
             for d, trajectory in smoothed.items()
         },
         motion_terms={d: term for d, term in terms.items() if term is not None},
-        parameters=parameter_priors(list(smoothed.values())),
+        parameters=parameters,
+        given_rates=rates,
         offsets=config.free_offsets() & set(lidars),
         twists=np.concatenate(twists) if twists else None,
         accelerations=np.concatenate(accelerations) if accelerations else None,
@@ -393,6 +408,22 @@ def pose_problem(
         cloud_apart_s=apart_s,
         cloud_turn_rad=_turns(clouds, smoothed) if apart_s.any() else None,
     )
+
+
+def _given_rates(
+    trajectories: Sequence[VehicleTrajectory], poses: Sequence[tuple[int, int]]
+) -> Array | None:
+    """`Problem.given_rates`; None: no poses were given, but by an odometry."""
+    out, any_given = np.zeros((len(poses), 6)), False
+    for d in sorted({drive for drive, _ in poses}):
+        trajectory = trajectories[d]
+        if not isinstance(trajectory, GivenTrajectory) or trajectory.odometry is not None:
+            continue
+        own = [i for i, (drive, _) in enumerate(poses) if drive == d]
+        stamps = [poses[i][1] for i in own]
+        R, _ = trajectory.poses_at(stamps)
+        out[own], any_given = rates_of_errors(R, twists_at(trajectory, stamps)), True
+    return out if any_given else None
 
 
 def _turns(

@@ -15,6 +15,7 @@ from scipy.linalg import block_diag
 
 from caliv_graph.calibration.heave import with_heave
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
     key_imu_rotation,
@@ -44,6 +45,9 @@ from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
 
 ParameterValue = Array | gtsam.Rot3
 
+POSE_TIME_OFFSET = "poses.time_offset"
+"""Name of the time offset of given poses: their stamps less the true times."""
+
 KEYS = {
     LEVER_ARM.name: key_lever_arm(),
     IMU_ROTATION.name: key_imu_rotation(),
@@ -51,6 +55,7 @@ KEYS = {
     GNSS_TIME_OFFSET.name: key_sensor_offset(0),
     IMU_TIME_OFFSET.name: key_sensor_offset(1),
     WHEELS_TIME_OFFSET.name: key_sensor_offset(2),
+    POSE_TIME_OFFSET: key_sensor_offset(3),
 }
 """Parameter of the input -> its key: (3,) metres in the vehicle frame, R_vehicle_imu,
 R_vehicle_wheels, and (1,) seconds."""
@@ -62,6 +67,7 @@ NAMES = {
     GNSS_TIME_OFFSET.name: "gnss_time_offset",
     IMU_TIME_OFFSET.name: "imu_time_offset",
     WHEELS_TIME_OFFSET.name: "twist_time_offset",
+    POSE_TIME_OFFSET: "pose_time_offset",
 }
 """What they are called in a result."""
 
@@ -79,7 +85,7 @@ USUAL_SIGMAS = {
     LEVER_ARM.name: DEFAULT_GUESS_SIGMAS[3:],
     IMU_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
     WHEELS_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
-    **dict.fromkeys(CLOCKS, np.full(1, USUAL_LATE_S)),
+    **dict.fromkeys([*CLOCKS, POSE_TIME_OFFSET], np.full(1, USUAL_LATE_S)),
 }
 """A parameter that nobody measured is judged by the usual guess of a mount, as extrinsics are."""
 
@@ -162,7 +168,7 @@ def motion_gaussian(
 
 
 def parameter_priors(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, ParameterPrior]:
-    """The prior of each uncertain parameter, counted once for all drives; the first drive's.
+    """The prior of each uncertain parameter of smoothed drives, counted once; the first drive's.
 
     They differ between drives only where the rotation of the IMU was guessed from the data.
     """
@@ -184,6 +190,24 @@ def parameter_priors(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, Pa
         cov[2, 2] = HELD_M**2
         out[LEVER_ARM.name] = replace(arm, cov=cov, held=(False, False, True))
     return {name: out[name] for name in KEYS if name in out}
+
+
+def pose_clock_prior(sigma_s: float) -> ParameterPrior:
+    """The prior of the time offset of given poses."""
+    sigma = np.full(1, sigma_s)
+    return ParameterPrior(np.zeros(1), np.diag(sigma**2), sigma)
+
+
+def pose_clock_sigma(config: Config) -> float | None:
+    """1 sigma of it in seconds; None: zero. Where LiDARs have offsets of their own it has none."""
+    return None if config.solve.time_offset else config.noise.pose_time_offset_s or None
+
+
+def rates_of_errors(R_map_vehicle: Array, twists: Array) -> Array:
+    """(n, 6) of twists (n, 6), vehicle axes: what a second of lateness is as an error of poses."""
+    out = twists.copy()
+    out[:, 3:] = np.einsum("nij,nj->ni", R_map_vehicle, twists[:, 3:])
+    return out
 
 
 class _Marginals(Protocol):

@@ -31,6 +31,11 @@ class NoiseConfig(Section):
     pose_drift_rotation_deg: Positive | None = Field(
         None, description="degrees, slowly varying error of the given poses over the drive"
     )
+    pose_time_offset_s: NonNegative = Field(
+        0.02,
+        description="seconds, 1 sigma of the stamps of given poses less the true times, in the "
+        "clock of the LiDARs, where they are not synchronised; 0: exact",
+    )
     pose_drift_time_s: Positive = Field(
         4.0, description="seconds, correlation time of the slowly varying error of given poses"
     )

@@ -75,6 +75,7 @@ class VehiclePart(Part):
     gnss_time_offset: _ClockPart | None = None
     imu_time_offset: _ClockPart | None = None
     twist_time_offset: _ClockPart | None = None
+    pose_time_offset: _ClockPart | None = None
 
     def parameters(self) -> dict[str, VehicleParameter]:
         """In metres, seconds and radians."""

@@ -34,6 +34,7 @@ PARAMETER_KEYS = {
     "gnss_time_offset": "gnss.time_offset",
     "imu_time_offset": "imu.time_offset",
     "twist_time_offset": "twist.time_offset",
+    "pose_time_offset": "time offset of topics.pose",
     "speed_scale": "scale of the speeds in topics.twist",
 }
 """What was measured on the vehicle, or is the clock of a sensor -> what messages call it."""

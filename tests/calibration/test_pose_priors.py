@@ -12,13 +12,17 @@ from caliv_graph.calibration.graph import initial_values, pose_graph
 from caliv_graph.calibration.linear import dense_system
 from caliv_graph.calibration.pose_priors import pose_priors
 from caliv_graph.calibration.problem import pose_problem
+from caliv_graph.calibration.vehicle_parameters import POSE_TIME_OFFSET
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, PoseNoise, Trajectory
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from tests.calibration.problems import eight
 from tests.calibration.test_vehicle_parameters import CONFIG, WANTED, drive
 
+EXACT = CONFIG.model_copy(
+    update={"noise": CONFIG.noise.model_copy(update={"pose_time_offset_s": 0.0})}
+)
 NOISE = PoseNoise(2e-4, 2e-3, 1e-3, 0.01, 1.5)
 STAMPS = np.arange(8, dtype=np.int64) * 300_000_000
 
@@ -62,8 +66,24 @@ def test_given_poses_have_the_errors_of_the_graph(stated: bool) -> None:
 
     expected = of_graph(trajectory, CONFIG, STAMPS[kept].tolist())
     np.testing.assert_allclose(marginal(prior, kept), expected, rtol=1e-6, atol=1e-14)
-    assert not prior.parameters
+    assert list(prior.parameters) == [POSE_TIME_OFFSET]
     assert all(a.equals(b, 1e-9) for a, b in zip(prior.T_map_vehicle, eight(8), strict=True))
+
+
+def test_given_poses_that_are_late_are_moved_along_the_drive() -> None:
+    trajectory = given()
+    prior = pose_priors([trajectory], {0: STAMPS}, 0.005, NOISE, CONFIG)[0]
+    exact = pose_priors([trajectory], {0: STAMPS}, 0.005, NOISE, EXACT)[0]
+    assert not exact.parameters
+    late_s = 0.013
+    moves = late_s * twists_at(trajectory, STAMPS.tolist()).ravel()
+
+    # Poses that are ahead of the given ones by 13 ms have no residuals if these are as late.
+    d = np.append(moves, late_s)
+    assert d @ prior.information @ d == pytest.approx(0.0, abs=1e-6)
+    # Without the clock they have; and where the clock is known both priors are the same.
+    assert moves @ exact.information @ moves > 1.0
+    np.testing.assert_allclose(prior.information[:-1, :-1], exact.information, rtol=1e-12)
 
 
 def test_smoothed_poses_have_heave_and_the_vehicles_parameters() -> None:

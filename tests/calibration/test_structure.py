@@ -53,6 +53,7 @@ def config_of(*lidars: str, reference: str = "rear", time_offset: bool = False) 
         },
         "reference": reference,
         "solve": {"time_offset": time_offset},
+        "noise": {"pose_time_offset_s": 0.0},
     }
     return Config.model_validate(raw)
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+
+import numpy as np
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
+from caliv_graph.config.model import Config
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import MotionData
+from caliv_graph.products import GivenPoses, MotionData
 from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.writer import config_of
@@ -18,7 +22,7 @@ from tests.kept import KeptDrive
 
 SCENARIOS = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
 
-GNSS_LATE_S, IMU_LATE_S = 0.025, 0.008
+GNSS_LATE_S, IMU_LATE_S, POSES_LATE_S = 0.025, 0.008, 0.012
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,11 @@ class Late(ForwardingRecording):
         )
 
 
+@cache
+def figure_eight() -> KeptDrive:
+    return KeptDrive(few_clouds(), 2)
+
+
 def few_clouds() -> Scenario:
     """The figure-eight with every third of its clouds."""
     scenario = load_scenario(SCENARIOS / "figure_eight.yaml")
@@ -52,12 +61,32 @@ def few_clouds() -> Scenario:
     return scenario.model_copy(update={"lidars": lidars, "crop": crop})
 
 
-def test_clocks_are_found_and_the_extrinsics_with_them() -> None:
-    drive = KeptDrive(few_clouds(), 2)
-    raw = config_of(drive, has_bag=True)
+@dataclass(frozen=True)
+class LatePoses(ForwardingRecording):
+    """A recording with poses in the place of raw sensors, 50 per second, stamped too late."""
+
+    def motion(self) -> MotionData:
+        drive = self.recording
+        assert isinstance(drive, KeptDrive)
+        stamps = np.arange(drive.truth.start_ns, drive.truth.end_ns, 20_000_000)
+        sigmas = np.repeat([5e-4, 5e-3], 3)
+        errors = np.random.default_rng(0).normal(0.0, sigmas, (len(stamps), 6))
+        truth = drive.truth.T_map_vehicle(stamps)
+        poses = tuple(T.retract(e) for T, e in zip(truth, errors, strict=True))
+        return MotionData(self.name, poses=GivenPoses(stamps + round(1e9 * POSES_LATE_S), poses))
+
+
+def quick_config(drive: KeptDrive, has_bag: bool) -> Config:
+    """Few components and scans, no structure."""
+    raw = config_of(drive, has_bag)
     raw["registration"] = {"components": 250, "max_points": 200}
     raw["extraction"] = {"max_scans": 30}
-    config = without_structure(parse_config(raw, "config.yaml", Path("/nowhere")))
+    return without_structure(parse_config(raw, "config.yaml", Path("/nowhere")))
+
+
+def test_clocks_are_found_and_the_extrinsics_with_them() -> None:
+    drive = figure_eight()
+    config = quick_config(drive, has_bag=True)
     late = Late(drive, GNSS_LATE_S, IMU_LATE_S)
 
     found = calibrate([late], config, SilentProgress()).calibration
@@ -70,5 +99,23 @@ def test_clocks_are_found_and_the_extrinsics_with_them() -> None:
     for of in evaluate(found, drive.truth.T_vehicle_lidar)["lidars"].values():
         # At 2 m/s, 25 ms are 50 mm.
         assert abs(of["s2v"]["translation_m"][0]) < 0.012
+        assert of["s2v"]["nees"] < 25.0
+    assert found.status == "ok"
+
+
+def test_the_clock_of_given_poses_is_found_and_the_extrinsics_with_it() -> None:
+    drive = figure_eight()
+    config = quick_config(drive, has_bag=False)
+
+    found = calibrate([LatePoses(drive)], config, SilentProgress()).calibration
+
+    (value,), (sigma,) = (
+        getattr(found.vehicle["pose_time_offset"], part) for part in ("value", "sigma")
+    )
+    assert abs(value - POSES_LATE_S) < 4.0 * sigma
+    assert sigma < 1.5e-3
+    for of in evaluate(found, drive.truth.T_vehicle_lidar)["lidars"].values():
+        # At 2 m/s, 12 ms are 24 mm.
+        assert abs(of["s2v"]["translation_m"][0]) < 0.010
         assert of["s2v"]["nees"] < 25.0
     assert found.status == "ok"

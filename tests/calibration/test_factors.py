@@ -319,6 +319,21 @@ def test_jacobians_of_a_given_pose(offset_m: float) -> None:
         given = random_pose(rng, offset_m)
         values = values_of(X=given.compose(random_pose(rng, 1.0, 1.0)), B=rng.uniform(-0.1, 0.1, 6))
         check_jacobians(given_pose_factor(X, B, given, 1e-3, 0.02), values, (X, B))
+        values.insert(LATE, rng.uniform(-0.1, 0.1, 1))
+        late = given_pose_factor(X, B, given, 1e-3, 0.02, None, (LATE, rng.uniform(-2.0, 2.0, 6)))
+        check_jacobians(late, values, (X, B, LATE))
+
+
+def test_a_given_pose_that_is_late_is_where_the_vehicle_was() -> None:
+    # Heading north at 2 m/s and turning left at 0.3 rad/s; the pose is of 10 ms before its stamp.
+    given = gtsam.Pose3(gtsam.Rot3.Yaw(math.pi / 2), np.array([100.0, 50.0, 1.0]))
+    turned = given.rotation().compose(gtsam.Rot3.Yaw(0.003))
+    now = gtsam.Pose3(turned, np.array([100.0, 50.02, 1.0]))
+    values = values_of(X=now, B=np.zeros(6))
+    values.insert(LATE, np.array([0.01]))
+    rates = np.array([0.0, 0.0, 0.3, 0.0, 2.0, 0.0])
+    factor = given_pose_factor(X, B, given, 1e-3, 0.02, None, (LATE, rates))
+    assert factor.unwhitenedError(values) == pytest.approx(np.zeros(6), abs=1e-12)
 
 
 def test_rotation_in_vehicle_axes_position_in_map_axes() -> None:

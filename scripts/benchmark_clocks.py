@@ -1,0 +1,182 @@
+"""Stamps that are late: what they do to S2V, and whether the clocks are found.
+
+Needs the environment that scripts/demo makes:
+
+    .venv/bin/python scripts/benchmark_clocks.py --scenarios yard figure_eight --seeds 3 --jobs 2
+
+Every run simulates a drive, makes the stamps of one sensor late, and calibrates it with the config
+that `simulate` writes, from raw sensors or from poses (50 Hz, white errors of 5 mm and 0.5 mrad).
+Errors are of S2V x of all LiDARs, against their sigmas; NEES is 6 on average if the covariance is
+right. `--exact` takes all clocks as exact.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process per core
+
+import numpy as np
+
+from caliv_graph.common.exits import exit_code
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.errors import CalivError
+from caliv_graph.pipeline import calibrate
+from caliv_graph.products import GivenPoses, MotionData
+from caliv_graph.readers.forwarding import ForwardingRecording
+from caliv_graph.scenario.model import Scenario, load_scenario
+from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
+from caliv_graph.simulation.writer import config_of
+from caliv_graph.uncertainty.evaluation import evaluate
+
+FOLDER = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
+
+POSE_PERIOD_NS, POSE_SIGMAS = 20_000_000, np.repeat([5e-4, 5e-3], 3)
+
+ROWS: dict[str, tuple[str, float]] = {
+    "on time": ("", 0.0),
+    "GNSS 5 ms late": ("gnss", 0.005),
+    "GNSS 20 ms late": ("gnss", 0.020),
+    "GNSS 50 ms late": ("gnss", 0.050),
+    "IMU 5 ms late": ("imu", 0.005),
+    "all LiDARs 5 ms late": ("lidars", 0.005),
+    "poses, on time": ("poses", 0.0),
+    "poses 10 ms late": ("poses", 0.010),
+}
+"""Name of a row -> whose stamps are late, and by how many seconds; `poses`: poses are given."""
+
+
+@dataclass(frozen=True)
+class Late(ForwardingRecording):
+    """A simulated drive with late stamps; of `poses`, with poses in the place of raw sensors."""
+
+    sensor: str
+    late_s: float
+
+    def motion(self) -> MotionData:
+        motion, late_ns = super().motion(), round(1e9 * self.late_s)
+        if self.sensor == "gnss" and motion.gnss is not None:
+            stamps = motion.gnss.stamps_ns + late_ns
+            return replace(motion, gnss=replace(motion.gnss, stamps_ns=stamps))
+        if self.sensor == "imu" and motion.imu is not None:
+            stamps = motion.imu.stamps_ns + late_ns
+            return replace(motion, imu=replace(motion.imu, stamps_ns=stamps))
+        if self.sensor == "poses":
+            return MotionData(motion.name, poses=self._poses(late_ns))
+        return motion
+
+    def _poses(self, late_ns: int) -> GivenPoses:
+        drive = self.recording
+        assert isinstance(drive, SimulatedRecording)
+        stamps = np.arange(drive.truth.start_ns, drive.truth.end_ns, POSE_PERIOD_NS)
+        errors = np.random.default_rng(drive.seed).normal(0.0, POSE_SIGMAS, (len(stamps), 6))
+        truth = drive.truth.T_map_vehicle(stamps)
+        poses = [T.retract(e) for T, e in zip(truth, errors, strict=True)]
+        return GivenPoses(stamps + late_ns, tuple(poses))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One run: exit code or the reason of a failure; errors and sigmas of S2V x, NEES, clocks."""
+
+    status: str
+    errors_m: tuple[float, ...] = ()
+    sigmas_m: tuple[float, ...] = ()
+    nees: tuple[float, ...] = ()
+    clocks: str = ""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenarios", nargs="+", default=["yard"], metavar="NAME")
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS))
+    parser.add_argument("--seeds", type=int, default=3, help="seeds 1 to N (default: 3)")
+    parser.add_argument("--jobs", type=int, default=1, help="at a time (default: 1)")
+    parser.add_argument("--exact", action="store_true", help="take all clocks as exact")
+    asked = parser.parse_args()
+    seeds = range(1, asked.seeds + 1)
+    cells = [(scenario, row) for scenario in asked.scenarios for row in asked.rows]
+    tasks = [(scenario, row, seed, asked.exact) for scenario, row in cells for seed in seeds]
+    with ProcessPoolExecutor(asked.jobs, get_context("spawn")) as pool:
+        outcomes = pool.map(run, tasks)
+        for scenario, row in cells:
+            print(line(scenario, row, [next(outcomes) for _ in seeds]), flush=True)
+    return 0
+
+
+def run(task: tuple[str, str, int, bool]) -> Outcome:
+    """Simulates, calibrates and compares once."""
+    name, row, seed, exact = task
+    sensor, late_s = ROWS[row]
+    scenario = load_scenario(FOLDER / f"{name}.yaml")
+    if sensor == "lidars":
+        scenario = with_late_lidars(scenario, late_s)
+    drive = simulate_drive(scenario, seed)
+    raw = config_of(drive, has_bag=sensor != "poses")
+    if sensor == "poses":
+        raw.pop("noise", None)
+    for section, key in (("gnss", ""), ("imu", ""), ("noise", "pose_")):
+        if exact:
+            raw.setdefault(section, {})[f"{key}time_offset{'_sigma' if not key else ''}_s"] = 0.0
+    try:
+        config = parse_config(raw, f"{name}.yaml", FOLDER)
+        found = calibrate([Late(drive, sensor, late_s)], config, SilentProgress()).calibration
+    except CalivError as e:
+        return Outcome(str(e))
+    errors: dict[str, Any] = evaluate(found, drive.truth.T_vehicle_lidar)["lidars"]
+    sigmas = {}
+    for lidar, result in found.lidars.items():
+        R = result.T_vehicle_lidar.rotation().matrix()
+        sigmas[lidar] = float(np.sqrt((R @ result.cov[3:, 3:] @ R.T)[0, 0]))
+    clocks = [
+        f"{key.removesuffix('_time_offset')} {1e3 * float(of.value[0]):+.1f} +- "
+        f"{1e3 * float(of.sigma[0]):.1f}"
+        for key, of in found.vehicle.items()
+        if key.endswith("_time_offset")
+    ]
+    return Outcome(
+        f"exit {exit_code(found)}",
+        tuple(float(of["s2v"]["translation_m"][0]) for of in errors.values()),
+        tuple(sigmas[lidar] for lidar in errors),
+        tuple(float(of["s2v"]["nees"]) for of in errors.values()),
+        ", ".join(clocks),
+    )
+
+
+def with_late_lidars(scenario: Scenario, late_s: float) -> Scenario:
+    """The stamps of all LiDARs late alike."""
+    lidars = {
+        name: lidar.model_copy(update={"time_offset_s": late_s})
+        for name, lidar in scenario.lidars.items()
+    }
+    return scenario.model_copy(update={"lidars": lidars})
+
+
+def line(scenario: str, row: str, outcomes: Sequence[Outcome]) -> str:
+    """RMSE of S2V x, rms of its sigma, mean NEES; exit codes, and the clocks of the first seed."""
+    done = [o for o in outcomes if o.errors_m]
+    status = ", ".join(sorted({o.status for o in outcomes}))
+    if not done:
+        return f"{scenario:14}{row:22} {status}"
+    error, sigma, nees = (
+        np.concatenate([np.array(getattr(o, name)) for o in done])
+        for name in ("errors_m", "sigmas_m", "nees")
+    )
+    return (
+        f"{scenario:14}{row:22}S2V x {1e3 * np.sqrt(np.mean(error**2)):6.2f} mm, sigma "
+        f"{1e3 * np.sqrt(np.mean(sigma**2)):5.2f}, NEES {np.mean(nees):7.1f}, {status}; "
+        f"seed 1, ms: {done[0].clocks or 'none'}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

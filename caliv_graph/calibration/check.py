@@ -38,6 +38,7 @@ from caliv_graph.uncertainty.consistency import (
     ScoreTest,
 )
 from caliv_graph.wording.contradictions import contradiction_sentence
+from caliv_graph.wording.offsets import late_clock_sentences
 from caliv_graph.wording.suspects import doubt_sentence, ranking_sentence
 
 _MOTION_INPUTS = ("gnss.", "poses.", "imu.", "twist.", "wheels.", "heading.")
@@ -122,7 +123,8 @@ def check(
         if heading.warning and not turned and drives[index] not in said
     )
     doubts = filter(None, [doubt_sentence(suspects)])
-    return calibration, (*doubts, *disagreements, *untested)
+    late = late_clock_sentences(calibration.vehicle)
+    return calibration, (*doubts, *late, *disagreements, *untested)
 
 
 def _between_parts(

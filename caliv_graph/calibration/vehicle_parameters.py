@@ -226,12 +226,12 @@ def estimated_parameters(
         own = solved.covariance_of(KEYS[name], cov)
         if isinstance(prior.mean, gtsam.Rot3):
             R = values.atRot3(KEYS[name])
-            value, own = R.rpy(), R.matrix() @ own @ R.matrix().T
+            value, own, known = R.rpy(), R.matrix() @ own @ R.matrix().T, prior.sigmas**-2.0
         else:
-            value = values.atVector(KEYS[name])
+            value, known = values.atVector(KEYS[name]), 1.0 / np.diag(prior.cov)
         variance = np.diag(own)
-        # What the drive knows is what the result knows beyond the prior.
-        by_drive = np.maximum(1.0 / variance - prior.sigmas**-2.0, 0.0)
+        # What the drive knows is what the result knows beyond the prior that it was solved under.
+        by_drive = np.maximum(1.0 / variance - known, 0.0)
         limit = UNDETERMINED_RATIO * np.minimum(prior.sigmas, USUAL_SIGMAS[name])
         determined = by_drive > limit**-2.0
         if prior.held:

@@ -19,6 +19,8 @@ def vehicle_text(name: str, found: VehicleParameter) -> str:
     if name in TIME_OFFSETS:
         value_ms, sigma_ms = 1e3 * float(found.value[0]), 1e3 * float(found.sigma[0])
         text = f"{PARAMETER_KEYS[name]}: {value_ms:+.2f} ms, sigma {sigma_ms:.2f} ms"
+        if not found.determined[0]:
+            text = f"{PARAMETER_KEYS[name]}: not determined, sigma {sigma_ms:.2f} ms"
         return f"{text}{_limits(found)}"
     turn = name in TURNS
     unit, digits = ("degrees", 2) if turn else ("m", 3)

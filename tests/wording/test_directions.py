@@ -282,6 +282,10 @@ def test_a_measured_figure_comes_with_what_it_limits() -> None:
         "gnss.time_offset: +25.10 ms, sigma 0.31 ms. Half or more of the variance of S2V x comes "
         "from it"
     )
+    open_clock = VehicleParameter(np.array([2e-4]), np.array([8.9e-3]), (False,))
+    assert vehicle_text("imu_time_offset", open_clock) == (
+        "imu.time_offset: not determined, sigma 8.90 ms"
+    )
 
 
 # ------------------------------------------------------------------ walls instead of a target

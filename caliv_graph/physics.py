@@ -110,8 +110,9 @@ def clock_findings(
     outvotes the target. What else is wrong beyond 5 sigma may bend walls as a late clock does.
     `names` are of the drives.
 
-    Surfaces tell the clocks of LiDARs against that of the IMU. Where this was estimated as off, the
-    fewer wrong clocks are the likelier: that of the IMU, unless one LiDAR alone explains as much.
+    Surfaces tell the clocks of LiDARs against that of the IMU or the poses. Where this was
+    estimated as off, the fewer wrong clocks are the likelier: that one, unless one LiDAR alone
+    explains as much.
     """
     suspects = calibration.suspects
     if suspects and suspects[0].sigmas > CONTRADICTION_SIGMAS:
@@ -119,7 +120,7 @@ def clock_findings(
     inertial = [
         float(found.value[0])
         for name, found in calibration.vehicle.items()
-        if name in ("imu_time_offset", "twist_time_offset")
+        if name in ("imu_time_offset", "twist_time_offset", "pose_time_offset")
     ]
 
     def against(imu_late_s: float) -> tuple[Finding, ...]:

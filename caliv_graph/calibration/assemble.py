@@ -166,7 +166,7 @@ def structure_summary(
 
 
 def _vehicle(solution: Solution) -> dict[str, VehicleParameter]:
-    """Lever arm and rotation of the IMU, with the axes of S2V that they limit."""
+    """Parameters of the vehicle, with the axes of S2V that they limit."""
     return {
         name: replace(
             found,

@@ -49,12 +49,14 @@ def under_clock_prior(state: SolveState, reduced: Reduced, undetermined: int | N
         return Moments(float(value[0]), float(reduced.covariance_of(KEYS[clock], cov)[0, 0]))
 
     exact = Moments(0.0, SYNCHRONISED_S**2)
-    clocks = {POSE_TIME_OFFSET: [(WITH_LIDARS + WITH_IMU, exact)]}
-    clocks[GNSS_TIME_OFFSET.name] = [(WITH_LIDARS, exact)]
-    for inertial in {IMU_TIME_OFFSET.name, WHEELS_TIME_OFFSET.name} & problem.parameters.keys():
-        other = of(inertial)
-        with_it = replace(other, variance=other.variance + SYNCHRONISED_S**2)
-        clocks[GNSS_TIME_OFFSET.name].append((WITH_IMU, with_it))
+    alone = [(WITH_LIDARS + WITH_IMU, exact)]
+    clocks = {POSE_TIME_OFFSET: alone, GNSS_TIME_OFFSET.name: alone}
+    # The other clock, if it is not that of the LiDARs by definition.
+    for inertial in (WHEELS_TIME_OFFSET.name, IMU_TIME_OFFSET.name):
+        if inertial in problem.parameters:
+            other = of(inertial)
+            with_it = replace(other, variance=other.variance + SYNCHRONISED_S**2)
+            clocks[GNSS_TIME_OFFSET.name] = [(WITH_LIDARS, exact), (WITH_IMU, with_it)]
     priors = dict(problem.parameters)
     for name in clocks.keys() & priors.keys():
         prior = priors[name]

@@ -18,6 +18,7 @@ from caliv_graph.calibration.vehicle_parameters import (
     ParameterPrior,
     ParameterValue,
     chart_of,
+    late_twists,
     motion_gaussian,
     parameter_priors,
     pose_clock_prior,
@@ -30,7 +31,7 @@ from caliv_graph.products import Array, IntArray, PoseNoise
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.trajectory.chain import inverse_of
 from caliv_graph.trajectory.noise import given_pose_covariances
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 
 WALK_RAD, WALK_M = 1e-3, 0.02
@@ -121,7 +122,7 @@ def _on_poses(
 
 
 def _offset(prior: ParameterPrior, value: ParameterValue) -> Array:
-    """(3,) the value less the mean of its prior."""
+    """(p,) the value less the mean of its prior."""
     mean = prior.mean
     if isinstance(value, gtsam.Rot3) or isinstance(mean, gtsam.Rot3):
         assert isinstance(value, gtsam.Rot3)
@@ -165,7 +166,7 @@ def _given(
     return (
         prior
         if clock_s is None
-        else _with_clock(prior, twists_at(trajectory, stamps.tolist()), clock_s)
+        else _with_clock(prior, late_twists(trajectory, stamps.tolist()), clock_s)
     )
 
 

@@ -1,4 +1,4 @@
-"""Lever arm, rotation of the IMU and clock of the GNSS in the graph: one of each for all drives.
+"""Lever arm, rotation of the IMU and clocks in the calibration graph: one of each for all drives.
 
 The motion data of a drive are a Gaussian on its poses and on them (`README.md`, section 17).
 """
@@ -39,7 +39,7 @@ from caliv_graph.trajectory.parameters import (
     WHEELS_TIME_OFFSET,
     mount_rotation,
 )
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
 
@@ -97,7 +97,7 @@ look like shifts of the poses."""
 
 @dataclass(frozen=True)
 class MotionTerm:
-    """What the motion data of a drive say of its m poses and of k parameters.
+    """What the motion data of a drive say of its m poses and of parameters of the vehicle.
 
     Minus the log-likelihood is `d^T information d / 2 - gradient^T d`: coordinates of the poses in
     `chart`, then right perturbations of the parameters about `values`.
@@ -201,6 +201,17 @@ def pose_clock_prior(sigma_s: float) -> ParameterPrior:
 def pose_clock_sigma(config: Config) -> float | None:
     """1 sigma of it in seconds; None: zero. Where LiDARs have offsets of their own it has none."""
     return None if config.solve.time_offset else config.noise.pose_time_offset_s or None
+
+
+RATE_WINDOW_NS = 250_000_000
+"""Half the time over which the velocity of given poses is averaged for what their lateness does.
+Noise of the velocity does not go with a slow error of the poses, which takes up most of what the
+lateness does: over 0.1 s it made 10 ms look like 9."""
+
+
+def late_twists(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
+    """(m, 6) how a second of lateness moves given poses, right perturbations."""
+    return twists_at(trajectory, stamps_ns, RATE_WINDOW_NS)
 
 
 def rates_of_errors(R_map_vehicle: Array, twists: Array) -> Array:

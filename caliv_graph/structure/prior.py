@@ -30,8 +30,7 @@ class PosePrior:
         stamps_ns: (m,) of the poses, strictly increasing.
         T_map_vehicle: m poses at which d is zero, the drive's map.
         parameters: name of the input (`gnss.lever_arm`, `imu.T_vehicle_imu`) -> the value at which
-            d is zero: (3,) metres, R_vehicle_imu, or (1,) seconds. Empty: none is uncertain, or it
-            was given poses.
+            d is zero: (3,) metres, R_vehicle_imu, or (1,) seconds. Empty: none is uncertain.
         information: (6 m + p, 6 m + p), positive definite with `parameter_information` added; with
             rates 6 more.
         gradient: (6 m + p,), or 6 more.

@@ -188,20 +188,25 @@ def accelerations_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) ->
     return np.asarray(change / seconds[:, None])
 
 
-def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
-    """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second."""
-    before, after, seconds = _windows(trajectory, stamps_ns)
+def twists_at(
+    trajectory: VehicleTrajectory, stamps_ns: Sequence[int], half_ns: int = TWIST_WINDOW_NS
+) -> Array:
+    """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second.
+
+    `half_ns`: half the time over which it is averaged.
+    """
+    before, after, seconds = _windows(trajectory, stamps_ns, half_ns)
     first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
     steps = zip(first, second, seconds, strict=True)
     return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])
 
 
 def _windows(
-    trajectory: VehicleTrajectory, stamps_ns: Sequence[int]
+    trajectory: VehicleTrajectory, stamps_ns: Sequence[int], half_ns: int = TWIST_WINDOW_NS
 ) -> tuple[IntArray, IntArray, Array]:
     """(m,) begin and end of the time around each stamp that is averaged over, and its seconds."""
     begin, end = trajectory.span_ns
     stamps = np.asarray(stamps_ns, dtype=np.int64)
-    before = np.maximum(stamps - TWIST_WINDOW_NS, begin)
-    after = np.minimum(stamps + TWIST_WINDOW_NS, end)
+    before = np.maximum(stamps - half_ns, begin)
+    after = np.minimum(stamps + half_ns, end)
     return before, after, np.maximum((after - before) / NANOSECONDS_PER_SECOND, 1e-9)

@@ -95,8 +95,11 @@ def smooth_trajectory(
         kernel = data.config.robust.kernel
         settled = settle(data, nodes, robust.estimate, robust.dropped, kernel, parameters)
         if late := with_late_clock(settled):
-            data, before = settled.data, settled.estimate
-            settled = settle(data, nodes, before, robust.dropped, kernel, late)
+            settled = settle(settled.data, nodes, settled.estimate, robust.dropped, kernel, late)
+            # Fixes that the wrong time had put beside the path.
+            robust = solve_without_outliers(settled.data, nodes, settled.estimate.states)
+            late = settled.parameters
+            settled = settle(robust.data, nodes, robust.estimate, robust.dropped, kernel, late)
         robust = replace(robust, estimate=settled.estimate)  # one graph is enough
     linear = settled.estimate.graph.factors.linearize(settled.estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, settled.data, settled.estimate.states)

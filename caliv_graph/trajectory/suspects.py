@@ -82,7 +82,8 @@ def suspect_parameters(smoothed: SmoothedTrajectory) -> tuple[SuspectParameter, 
     if data.positions is not None:
         out.append(_known(smoothed, LEVER_ARM, ARM_M, ARM_KNOWN_M))
         out.append(_known(smoothed, GNSS_TIME_OFFSET, CLOCK_S, 1.0))
-    out.append(_known(smoothed, inertial_time_offset(data), CLOCK_S, 1.0))
+    if not data.config.solve.time_offset:  # else it is the clock that all others are against
+        out.append(_known(smoothed, inertial_time_offset(data), CLOCK_S, 1.0))
     if data.positions is not None or data.motion.twist is not None:
         out.append(_known(smoothed, mount_rotation(data), ROTATION_RAD, 0.5))
     if data.motion.twist is not None:

@@ -1,4 +1,4 @@
-"""Estimating the parameters that the user measured: lever arm and rotation of the IMU.
+"""Estimating parameters of the input: lever arm, rotation of the IMU, scales, clocks.
 
 Gauss-Newton over all states and the parameters at once, the parameters as one more variable of the
 linear graph (`README.md`, section 13). After a step the input is moved and the graph built anew.
@@ -83,6 +83,7 @@ class Settled:
         columns: (rows, p) derivatives of the estimate's whitened residuals by the parameters; None:
             there are none.
         cov: (p, p) of the parameters, priors included.
+        step: (p,) the last step, too small to be taken.
     """
 
     data: SmootherInput
@@ -90,6 +91,7 @@ class Settled:
     parameters: tuple[UncertainParameter, ...] = ()
     columns: Array | None = None
     cov: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    step: Array = field(default_factory=lambda: np.zeros(0))
 
 
 def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
@@ -199,7 +201,7 @@ def settle(
         states = from_values(estimate.values.retract(solution), len(nodes), data)
         del estimate, linear, tree, solution, root  # megabytes per minute of drive
         estimate = solve(data, nodes, states, dropped, kernel, tolerance)
-    return Settled(data, estimate, parameters, columns, cov)
+    return Settled(data, estimate, parameters, columns, cov, step)
 
 
 def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
@@ -216,7 +218,7 @@ def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
             assert p.offset is not None
             told = 1.0 / variances[at] - p.sigmas[0] ** -2.0
             # The offset is what the data alone say, times their part of all information.
-            pull = p.offset[0] / variances[at]
+            pull = (p.offset[0] + settled.step[at]) / variances[at]
             if pull**2 > LATE_SIGMAS**2 * max(told, 0.0) > 0.0:
                 p = replace(p, sigmas=p.beside_lidars)
         out.append(p)

@@ -19,11 +19,11 @@ def with_parameters(
     """The trajectory with more parameters in its chain, without a prior: none is estimated.
 
     `joint` of the result can be asked for their information and gradient. Those that the chain has
-    already stay as they are.
+    already stay as they are. The chain of the result has all nodes.
     """
     known = {p.parameter.name for p in smoothed.parameters}
     more = tuple(UncertainParameter(p) for p in parameters if p.name not in known)
-    if not more:
+    if not more and smoothed.chain_nodes is None:
         return smoothed
     every = (*smoothed.parameters, *more)
     estimate = smoothed.estimate()

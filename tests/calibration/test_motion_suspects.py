@@ -18,6 +18,7 @@ from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.uncertainty.suspects import ranking
 from caliv_graph.wording.suspects import motion_sentence
 from tests.trajectory.motions import Course, config_for, eight_drive, mounted_askew, record, stamps
+from tests.trajectory.test_wheels import ANTENNA, wheels
 
 COURSE = Course(eight_drive(14.0), rough=1.0)
 SENSORS = mounted_askew()
@@ -49,6 +50,23 @@ def too_fast(motion: MotionData) -> MotionData:
     assert motion.twist is not None
     twist = replace(motion.twist, velocity=1.2 * motion.twist.velocity)
     return replace(motion, twist=twist)
+
+
+def test_wheels_without_an_imu_have_suspects_whose_clocks_are_estimated() -> None:
+    """All of them are in the chain of the smoothed trajectory, which has the wanted poses alone."""
+    motion = wheels(1)
+    config = config_for(
+        ANTENNA,
+        gnss={"lever_arm": list(ANTENNA.lever_arm), "time_offset_sigma_s": 0.02},
+        wheels={"tilt_sigma_deg": 0.1, "slip_sigma_deg": 0.1, "time_offset_sigma_s": 0.01},
+    )
+    smoothed = smooth_trajectory(motion, config, WANTED)
+    assert {"gnss.time_offset", "twist.time_offset"} <= {
+        p.parameter.name for p in smoothed.parameters
+    }
+    found = motion_suspects([smoothed], {0: motion}, config)
+    assert {"gnss.time_offset", "twist.time_offset"} <= {s.input for s in found}
+    assert all(s.sigmas < 4.0 for s in found)
 
 
 @pytest.mark.parametrize(("noise", "seed"), [(1.0, 1), (2.0, 2)])

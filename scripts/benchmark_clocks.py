@@ -44,6 +44,7 @@ POSE_PERIOD_NS, POSE_SIGMAS = 20_000_000, np.repeat([5e-4, 5e-3], 3)
 
 ROWS: dict[str, tuple[str, float]] = {
     "on time": ("", 0.0),
+    "GNSS 3 ms late": ("gnss", 0.003),
     "GNSS 5 ms late": ("gnss", 0.005),
     "GNSS 20 ms late": ("gnss", 0.020),
     "GNSS 50 ms late": ("gnss", 0.050),

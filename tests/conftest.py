@@ -22,6 +22,7 @@ LONGEST = (
     "tests/targets/search/test_find.py",
     "tests/robustness/test_spoiled_drives.py",
     "tests/test_raw_sensors.py",
+    "tests/test_late_clocks.py",
     "tests/robustness/test_outputs.py",
     "tests/cli/test_batch.py",
     "tests/report/test_html.py",

@@ -50,14 +50,14 @@ def figure_eight() -> KeptDrive:
 
 
 def few_clouds() -> Scenario:
-    """The figure-eight with every third of its clouds."""
+    """The figure-eight with every sixth of its clouds."""
     scenario = load_scenario(SCENARIOS / "figure_eight.yaml")
     lidars = {
-        name: lidar.model_copy(update={"rate_hz": 10 / 3})
+        name: lidar.model_copy(update={"rate_hz": 10 / 6})
         for name, lidar in scenario.lidars.items()
     }
     assert scenario.crop is not None
-    crop = scenario.crop.model_copy(update={"elsewhere_stride": 16})
+    crop = scenario.crop.model_copy(update={"elsewhere_stride": 32})
     return scenario.model_copy(update={"lidars": lidars, "crop": crop})
 
 
@@ -79,8 +79,8 @@ class LatePoses(ForwardingRecording):
 def quick_config(drive: KeptDrive, has_bag: bool) -> Config:
     """Few components and scans, no structure."""
     raw = config_of(drive, has_bag)
-    raw["registration"] = {"components": 250, "max_points": 200}
-    raw["extraction"] = {"max_scans": 30}
+    raw["registration"] = {"components": 150, "max_points": 120}
+    raw["extraction"] = {"max_scans": 24}
     return without_structure(parse_config(raw, "config.yaml", Path("/nowhere")))
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -30,6 +30,7 @@ from caliv_graph.common.exits import exit_code
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.errors import CalivError
+from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import GivenPoses, MotionData
 from caliv_graph.readers.forwarding import ForwardingRecording
@@ -41,6 +42,13 @@ from caliv_graph.uncertainty.evaluation import evaluate
 FOLDER = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
 
 POSE_PERIOD_NS, POSE_SIGMAS = 20_000_000, np.repeat([5e-4, 5e-3], 3)
+
+EXACT = {
+    "gnss": {"time_offset_sigma_s": 0.0},
+    "imu": {"time_offset_sigma_s": 0.0},
+    "noise": {"pose_time_offset_s": 0.0},
+}
+"""Sections of a config that takes all clocks as exact."""
 
 ROWS: dict[str, tuple[str, float]] = {
     "on time": ("", 0.0),
@@ -58,22 +66,24 @@ ROWS: dict[str, tuple[str, float]] = {
 
 @dataclass(frozen=True)
 class Late(ForwardingRecording):
-    """A simulated drive with late stamps; of `poses`, with poses in the place of raw sensors."""
+    """A simulated drive with stamps of `gnss` and `imu` that are late by these seconds.
 
-    sensor: str
-    late_s: float
+    With `poses` among them it has poses in the place of raw sensors.
+    """
+
+    late_s: Mapping[str, float]
 
     def motion(self) -> MotionData:
-        motion, late_ns = super().motion(), round(1e9 * self.late_s)
-        if self.sensor == "gnss" and motion.gnss is not None:
-            stamps = motion.gnss.stamps_ns + late_ns
-            return replace(motion, gnss=replace(motion.gnss, stamps_ns=stamps))
-        if self.sensor == "imu" and motion.imu is not None:
-            stamps = motion.imu.stamps_ns + late_ns
-            return replace(motion, imu=replace(motion.imu, stamps_ns=stamps))
-        if self.sensor == "poses":
-            return MotionData(motion.name, poses=self._poses(late_ns))
-        return motion
+        motion = super().motion()
+        late_ns = {sensor: round(1e9 * late_s) for sensor, late_s in self.late_s.items()}
+        if "poses" in late_ns:
+            return MotionData(motion.name, poses=self._poses(late_ns["poses"]))
+        gnss, imu = motion.gnss, motion.imu
+        if gnss is not None:
+            gnss = replace(gnss, stamps_ns=gnss.stamps_ns + late_ns.get("gnss", 0))
+        if imu is not None:
+            imu = replace(imu, stamps_ns=imu.stamps_ns + late_ns.get("imu", 0))
+        return replace(motion, gnss=gnss, imu=imu)
 
     def _poses(self, late_ns: int) -> GivenPoses:
         drive = self.recording
@@ -125,19 +135,19 @@ def run(task: tuple[str, str, int, bool]) -> Outcome:
     raw = config_of(drive, has_bag=sensor != "poses")
     if sensor == "poses":
         raw.pop("noise", None)
-    for section, key in (("gnss", ""), ("imu", ""), ("noise", "pose_")):
-        if exact:
-            raw.setdefault(section, {})[f"{key}time_offset{'_sigma' if not key else ''}_s"] = 0.0
+    if exact:
+        for section, keys in EXACT.items():
+            raw.setdefault(section, {}).update(keys)
     try:
         config = parse_config(raw, f"{name}.yaml", FOLDER)
-        found = calibrate([Late(drive, sensor, late_s)], config, SilentProgress()).calibration
+        found = calibrate([Late(drive, {sensor: late_s})], config, SilentProgress()).calibration
     except CalivError as e:
         return Outcome(str(e))
     errors: dict[str, Any] = evaluate(found, drive.truth.T_vehicle_lidar)["lidars"]
     sigmas = {}
     for lidar, result in found.lidars.items():
-        R = result.T_vehicle_lidar.rotation().matrix()
-        sigmas[lidar] = float(np.sqrt((R @ result.cov[3:, 3:] @ R.T)[0, 0]))
+        axes = right_to_vehicle_axes(result.T_vehicle_lidar)
+        sigmas[lidar] = float(np.sqrt((axes @ result.cov @ axes.T)[3, 3]))
     clocks = [
         f"{key.removesuffix('_time_offset')} {1e3 * float(of.value[0]):+.1f} +- "
         f"{1e3 * float(of.sigma[0]):.1f}"

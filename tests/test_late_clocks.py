@@ -2,46 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-
-import numpy as np
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import GivenPoses, MotionData
-from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.evaluation import evaluate
+from scripts.benchmark_clocks import Late
 from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
 
 SCENARIOS = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
 
 GNSS_LATE_S, IMU_LATE_S, POSES_LATE_S = 0.025, 0.008, 0.012
-
-
-@dataclass(frozen=True)
-class Late(ForwardingRecording):
-    """A recording whose fixes and IMU samples are stamped too late, in seconds."""
-
-    gnss_s: float = 0.0
-    imu_s: float = 0.0
-
-    def motion(self) -> MotionData:
-        motion = super().motion()
-        assert motion.gnss is not None
-        assert motion.imu is not None
-        gnss, imu = motion.gnss, motion.imu
-        return replace(
-            motion,
-            gnss=replace(gnss, stamps_ns=gnss.stamps_ns + round(1e9 * self.gnss_s)),
-            imu=replace(imu, stamps_ns=imu.stamps_ns + round(1e9 * self.imu_s)),
-        )
 
 
 @cache
@@ -61,21 +38,6 @@ def few_clouds() -> Scenario:
     return scenario.model_copy(update={"lidars": lidars, "crop": crop})
 
 
-@dataclass(frozen=True)
-class LatePoses(ForwardingRecording):
-    """A recording with poses in the place of raw sensors, 50 per second, stamped too late."""
-
-    def motion(self) -> MotionData:
-        drive = self.recording
-        assert isinstance(drive, KeptDrive)
-        stamps = np.arange(drive.truth.start_ns, drive.truth.end_ns, 20_000_000)
-        sigmas = np.repeat([5e-4, 5e-3], 3)
-        errors = np.random.default_rng(0).normal(0.0, sigmas, (len(stamps), 6))
-        truth = drive.truth.T_map_vehicle(stamps)
-        poses = tuple(T.retract(e) for T, e in zip(truth, errors, strict=True))
-        return MotionData(self.name, poses=GivenPoses(stamps + round(1e9 * POSES_LATE_S), poses))
-
-
 def quick_config(drive: KeptDrive, has_bag: bool) -> Config:
     """Few components and scans, no structure."""
     raw = config_of(drive, has_bag)
@@ -87,7 +49,7 @@ def quick_config(drive: KeptDrive, has_bag: bool) -> Config:
 def test_clocks_are_found_and_the_extrinsics_with_them() -> None:
     drive = figure_eight()
     config = quick_config(drive, has_bag=True)
-    late = Late(drive, GNSS_LATE_S, IMU_LATE_S)
+    late = Late(drive, {"gnss": GNSS_LATE_S, "imu": IMU_LATE_S})
 
     found = calibrate([late], config, SilentProgress()).calibration
 
@@ -106,8 +68,9 @@ def test_clocks_are_found_and_the_extrinsics_with_them() -> None:
 def test_the_clock_of_given_poses_is_found_and_the_extrinsics_with_it() -> None:
     drive = figure_eight()
     config = quick_config(drive, has_bag=False)
+    late = Late(drive, {"poses": POSES_LATE_S})
 
-    found = calibrate([LatePoses(drive)], config, SilentProgress()).calibration
+    found = calibrate([late], config, SilentProgress()).calibration
 
     (value,), (sigma,) = (
         getattr(found.vehicle["pose_time_offset"], part) for part in ("value", "sigma")

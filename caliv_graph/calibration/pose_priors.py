@@ -22,7 +22,6 @@ from caliv_graph.calibration.vehicle_parameters import (
     motion_gaussian,
     parameter_priors,
     pose_clock_prior,
-    pose_clock_sigma,
 )
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
@@ -162,19 +161,16 @@ def _given(
     information[..., 3:] = np.einsum("jba,ikjb->ikja", R, information[..., 3:])
     flat = information.reshape(6 * m, 6 * m)
     prior = _on_poses(stamps, unstack(R, t), flat, np.zeros(6 * m))
-    clock_s = pose_clock_sigma(config)
-    return (
-        prior
-        if clock_s is None
-        else _with_clock(prior, late_twists(trajectory, stamps.tolist()), clock_s)
-    )
+    clock = pose_clock_prior(config)
+    if clock is None:
+        return prior
+    return _with_clock(prior, late_twists(trajectory, stamps.tolist()), clock)
 
 
-def _with_clock(prior: PosePrior, twists: Array, sigma_s: float) -> PosePrior:
+def _with_clock(prior: PosePrior, twists: Array, clock: ParameterPrior) -> PosePrior:
     """The prior of given poses that are all late alike: they are moved along `twists` (m, 6)."""
     late = twists.reshape(-1, 1)
     coupling = -prior.information @ late
-    clock = pose_clock_prior(sigma_s)
     return replace(
         prior,
         parameters={POSE_TIME_OFFSET: np.zeros(1)},

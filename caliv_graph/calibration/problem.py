@@ -22,7 +22,6 @@ from caliv_graph.calibration.vehicle_parameters import (
     motion_term,
     parameter_priors,
     pose_clock_prior,
-    pose_clock_sigma,
     rates_of_errors,
 )
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, configured_guess
@@ -371,10 +370,10 @@ def pose_problem(
         if isinstance(trajectory, SmoothedTrajectory) and d in origins
     }
     of_drive = {d: [stamp for drive, stamp in poses if drive == d] for d in smoothed}
-    clock_s, parameters = pose_clock_sigma(config), parameter_priors(list(smoothed.values()))
-    rates = None if clock_s is None else _given_rates(trajectories, poses)
-    if clock_s is not None and rates is not None:
-        parameters[POSE_TIME_OFFSET] = pose_clock_prior(clock_s)
+    clock, parameters = pose_clock_prior(config), parameter_priors(list(smoothed.values()))
+    rates = None if clock is None else _given_rates(trajectories, poses)
+    if clock is not None and rates is not None:
+        parameters[POSE_TIME_OFFSET] = clock
     terms = {d: motion_term(t, of_drive[d], heave_m) for d, t in smoothed.items()}
     of_pose = dict(zip(poses, T_map_vehicle, strict=True))
     return Problem(

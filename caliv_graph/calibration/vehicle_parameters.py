@@ -192,15 +192,15 @@ def parameter_priors(trajectories: Sequence[SmoothedTrajectory]) -> dict[str, Pa
     return {name: out[name] for name in KEYS if name in out}
 
 
-def pose_clock_prior(sigma_s: float) -> ParameterPrior:
-    """The prior of the time offset of given poses."""
-    sigma = np.full(1, sigma_s)
+def pose_clock_prior(config: Config) -> ParameterPrior | None:
+    """The prior of the time offset of given poses; None: it is zero.
+
+    So it is where LiDARs have offsets of their own.
+    """
+    sigma = np.full(1, config.noise.pose_time_offset_s)
+    if config.solve.time_offset or not sigma.any():
+        return None
     return ParameterPrior(np.zeros(1), np.diag(sigma**2), sigma)
-
-
-def pose_clock_sigma(config: Config) -> float | None:
-    """1 sigma of it in seconds; None: zero. Where LiDARs have offsets of their own it has none."""
-    return None if config.solve.time_offset else config.noise.pose_time_offset_s or None
 
 
 RATE_WINDOW_NS = 250_000_000

@@ -210,19 +210,21 @@ def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
     None: they do not. A trajectory under a clock that is off by 50 ms is bent by as much as LiDARs
     see of it.
     """
-    variances, out, first = np.diagonal(settled.cov), [], 0
-    for p in settled.parameters:
-        at, first = first, first + p.parameter.size
+    at, out = 0, list(settled.parameters)
+    for i, p in enumerate(out):
         if p.parameter is GNSS_TIME_OFFSET:
             assert p.sigmas is not None
             assert p.offset is not None
-            told = 1.0 / variances[at] - p.sigmas[0] ** -2.0
+            variance = settled.cov[at, at]
+            told = 1.0 / variance - p.sigmas[0] ** -2.0
             # The offset is what the data alone say, times their part of all information.
-            pull = (p.offset[0] + settled.step[at]) / variances[at]
-            if pull**2 > LATE_SIGMAS**2 * max(told, 0.0) > 0.0:
-                p = replace(p, sigmas=p.beside_lidars)
-        out.append(p)
-    return tuple(out) if any(p.sigmas is p.beside_lidars for p in out) else None
+            pull = (p.offset[0] + settled.step[at]) / variance
+            if not pull**2 > LATE_SIGMAS**2 * told > 0.0:
+                return None
+            out[i] = replace(p, sigmas=p.beside_lidars)
+            return tuple(out)
+        at += p.parameter.size
+    return None
 
 
 def moved(

@@ -17,11 +17,9 @@ def vehicle_text(name: str, found: VehicleParameter) -> str:
         turns, sigmas = (_numbers(np.degrees(v), 3) for v in (found.value, found.sigma))
         return f"{PARAMETER_KEYS[name]}: ({turns}), sigma ({sigmas}) degrees, one per drive"
     if name in TIME_OFFSETS:
-        value_ms, sigma_ms = 1e3 * float(found.value[0]), 1e3 * float(found.sigma[0])
-        text = f"{PARAMETER_KEYS[name]}: {value_ms:+.2f} ms, sigma {sigma_ms:.2f} ms"
-        if not found.determined[0]:
-            text = f"{PARAMETER_KEYS[name]}: not determined, sigma {sigma_ms:.2f} ms"
-        return f"{text}{_limits(found)}"
+        late = f"{1e3 * found.value[0]:+.2f} ms" if found.determined[0] else "not determined"
+        sigma_ms = 1e3 * float(found.sigma[0])
+        return f"{PARAMETER_KEYS[name]}: {late}, sigma {sigma_ms:.2f} ms{_limits(found)}"
     turn = name in TURNS
     unit, digits = ("degrees", 2) if turn else ("m", 3)
     value, sigma = (

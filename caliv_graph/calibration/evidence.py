@@ -33,7 +33,7 @@ from caliv_graph.calibration.motion_suspects import motion_parts
 from caliv_graph.calibration.noise import evenly_over_drives
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.solve import SolveState, measured_poses, of_single_clouds
-from caliv_graph.calibration.variance_components import Observed
+from caliv_graph.calibration.variance_components import Block, Observed
 from caliv_graph.config.range_errors import RangeErrors, range_errors
 from caliv_graph.conventions import key_ground, key_ground_bias, key_vehicle
 from caliv_graph.products import Array, IntArray, Registration
@@ -79,6 +79,7 @@ class Evidence:
         motion: per drive, what its motion data and its structure say of these errors.
         sensor_sigmas: kind of sensor -> (3,) white 1 sigma of one measurement, map axes.
         stated_over_white: of these, how many times as much its driver states, at most; none is 1.
+        clouds: the registration of each cloud, at sigma 1.
     """
 
     observed: Observed
@@ -88,6 +89,7 @@ class Evidence:
     motion: list[ErrorLikelihood] = field(default_factory=list)
     sensor_sigmas: dict[str, Array] = field(default_factory=dict)
     stated_over_white: dict[str, float] = field(default_factory=dict)
+    clouds: list[Block] = field(default_factory=list)
     _moved: dict[tuple[str, tuple[int, ...]], list[tuple[Array, IntArray]]] = field(
         default_factory=dict
     )
@@ -142,12 +144,14 @@ class _Rows:
         jacobians: (d, size) by key.
         known: (d, d) its covariance of known size.
         white: (d, d) by name of a white level, what that brings at sigma 1.
+        registration: (d, d) the same of the registration of a cloud.
     """
 
     residual: Array
     jacobians: Mapping[int, Array]
     known: Array
-    white: Mapping[str, Array]
+    white: Mapping[str, Array] = field(default_factory=dict)
+    registration: Array | None = None
 
 
 def linearised_evidence(
@@ -190,6 +194,11 @@ def linearised_evidence(
         white[name] = scipy.linalg.block_diag(
             *(row.white.get(name, np.zeros_like(row.known)) for row in rows)
         )
+    blocks = [
+        Block(part, row.registration)
+        for row, part in zip(rows, parts, strict=True)
+        if row.registration is not None
+    ]
     known = scipy.linalg.block_diag(*(row.known for row in rows))
     effects, inputs, scales = [], np.zeros((starts[-1], 0)), np.zeros(0)
     drives = _of_drives(problem, poses, trajectories)
@@ -214,7 +223,9 @@ def linearised_evidence(
     observed = Observed(residuals, np.hstack([design, inputs]), ridge, known)
     # Of all drives, those in which nobody sees a target too.
     by_motion = motion_evidence(trajectories, structure)
-    return replace(by_motion, observed=observed, by_pose=by_pose, white=white, effects=effects)
+    return replace(
+        by_motion, observed=observed, by_pose=by_pose, white=white, clouds=blocks, effects=effects
+    )
 
 
 @dataclass(frozen=True)
@@ -287,7 +298,7 @@ def _cloud_rows(
             gtsam.Pose3.Logmap(lines.predicted[j].compose(measured[j].inverse())),
             dict(zip(lines.keys[j], lines.jacobians[j], strict=True)),
             np.zeros((6, 6)),
-            {"registration": cov},
+            registration=cov,
         )
         for j, cov in zip(clouds.tolist(), covariances, strict=True)
     ]

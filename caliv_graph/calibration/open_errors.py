@@ -14,10 +14,17 @@ import numpy as np
 
 from caliv_graph.calibration.evidence import Evidence
 from caliv_graph.products import Array
-from caliv_graph.trajectory.correlated import AXES, CorrelatedError
+from caliv_graph.trajectory.correlated import AXES, GROUPS, CorrelatedError
 
 NONE = 0.5
 """Prior probability that the errors of a sensor are white: neither is presumed."""
+
+ALIKE = 0.5
+"""Prior probability that those which are not are as large, over the white sigma, along all axes:
+else horizontal and vertical ones have any sizes, none among them."""
+
+LEAST = 0.01
+"""Least expected size: a chain of errors needs one, and this does nothing."""
 
 SIZES = np.geomspace(0.1, 2.0, 6)
 """Of a correlated error, over the white sigma of the sensor: equally probable. The sigma that a
@@ -59,14 +66,13 @@ def sizes_of(evidence: Evidence, kind: str) -> Array:
 
 
 def of_expected_size(
-    evidence: Evidence, parts: Sequence[Array], sigmas: Array, found: Sequence[CorrelatedError]
+    evidence: Evidence, found: Sequence[CorrelatedError]
 ) -> tuple[CorrelatedError, ...]:
     """The errors of greatest likelihood with their expected sizes and times instead.
 
     The greatest likelihood of an error that barely shows is too small as often as too large, and
-    sigmas would be wrong by as much. Those beyond `SIZES` stay. Arguments as in `open_errors`.
+    sigmas would be wrong by as much. Those beyond `SIZES` stay. `evidence` as in `open_errors`.
     """
-    known = [(s**2) * part for s, part in zip(sigmas, parts, strict=True)]
     out = list(found)
     for i, error in enumerate(found):
         white = evidence.sensor_sigmas.get(error.kind)
@@ -74,14 +80,12 @@ def of_expected_size(
             continue
         if (np.array(error.sigmas) <= sizes_of(evidence, error.kind)[-1] * white).all():
             others = [*out[:i], *out[i + 1 :]]
-            out[i] = open_error(evidence, known, others, error.kind).expected
+            out[i] = open_error(evidence, others, error.kind).expected
     return tuple(out)
 
 
 def open_errors(
     evidence: Evidence,
-    parts: Sequence[Array],
-    sigmas: Array,
     found: Sequence[CorrelatedError],
     kinds: Sequence[str],
     none_from: float = SURELY_NONE,
@@ -89,18 +93,15 @@ def open_errors(
     """The errors of some sensors that may be there, of expected size; the most probable first.
 
     Args:
-        evidence: of LiDARs and motion data.
-        parts: (N, N) covariances at sigma 1 of the white errors of what the LiDARs see.
-        sigmas: of these.
+        evidence: of LiDARs and motion data; all white errors of what the LiDARs see are known.
         found: errors whose size is known.
         kinds: of the sensors that are left.
         none_from: posterior probability of none from which there is none.
     """
-    known = [(s**2) * part for s, part in zip(sigmas, parts, strict=True)]
     out: list[CorrelatedError] = []
     left = [kind for kind in kinds if kind in evidence.sensor_sigmas]
     while left:
-        posteriors = [open_error(evidence, known, [*found, *out], kind) for kind in left]
+        posteriors = [open_error(evidence, [*found, *out], kind) for kind in left]
         first = min(posteriors, key=lambda of: of.none)
         if first.none > none_from:
             break
@@ -109,43 +110,60 @@ def open_errors(
     return tuple(out)
 
 
-def open_error(
-    evidence: Evidence, known: Sequence[Array], found: Sequence[CorrelatedError], kind: str
-) -> OpenError:
-    """The posterior of one sensor's error.
-
-    `known` are (N, N) covariances of all other errors of what the LiDARs see, but for those of
-    `found`.
-    """
-    white, sizes = evidence.sensor_sigmas[kind], sizes_of(evidence, kind)
-    others = [*known, *(_covariance(evidence, e.kind, np.array(e.sigmas), e.time_s) for e in found)]
-    total = [np.sum(others, axis=0)] if others else []
-    at_one = np.zeros(len(total))
-    of_none = evidence.observed.value(total, at_one)
+def open_error(evidence: Evidence, found: Sequence[CorrelatedError], kind: str) -> OpenError:
+    """The posterior of one sensor's error; other arguments as in `open_errors`."""
+    sizes, groups = sizes_of(evidence, kind), _groups(evidence, kind)
+    others = [_covariance(evidence, e.kind, np.array(e.sigmas), e.time_s) for e in found]
+    at_one = np.zeros(len(others))
+    of_none = evidence.observed.value(others, at_one)
     motion = [of.given(found) for of in evidence.motion]
-    gain = np.zeros((len(sizes), len(TIMES_S)))
-    for j, time_s in enumerate(TIMES_S.tolist()):
-        moved = _covariance(evidence, kind, white, time_s)
-        seen = [
-            evidence.observed.value([*total, moved], np.append(at_one, math.log(size)))
-            for size in sizes.tolist()
-        ]
-        unit = _error(kind, white, time_s)
-        gain[:, j] = of_none - np.array(seen) + sum(of.gains(unit, sizes) for of in motion)
-    return _summary(kind, white, sizes, gain)
+    gain = np.zeros((len(groups), len(sizes), len(TIMES_S)))
+    for g, group in enumerate(groups):
+        for j, time_s in enumerate(TIMES_S.tolist()):
+            moved = _covariance(evidence, kind, group, time_s)
+            seen = [
+                evidence.observed.value([*others, moved], np.append(at_one, math.log(size)))
+                for size in sizes.tolist()
+            ]
+            unit = _error(kind, group, time_s)
+            gain[g, :, j] = of_none - np.array(seen) + sum(of.gains(unit, sizes) for of in motion)
+    return _summary(kind, groups, sizes, gain)
 
 
-def _summary(kind: str, white: Array, sizes: Array, gain: Array) -> OpenError:
-    """From the gain of log-likelihood by each size (rows) and time (columns) over no error."""
-    highest = max(0.0, float(gain.max()))
-    none = NONE * math.exp(-highest)
-    weight = (1.0 - NONE) * np.exp(gain - highest) / gain.size
-    total = none + weight.sum()
-    variance = weight * sizes[:, None] ** 2 / total
+def _groups(evidence: Evidence, kind: str) -> list[Array]:
+    """White sigmas (3,) along the map's axes for each group of axes, zero along others."""
+    white = evidence.sensor_sigmas[kind]
+    return [np.where(np.isin(np.arange(AXES), axes), white, 0.0) for axes in GROUPS[kind]]
+
+
+def _summary(kind: str, groups: Sequence[Array], sizes: Array, gain: Array) -> OpenError:
+    """From the gain of log-likelihood over no error, by group of axes, by size and by time.
+
+    What is known of one group does not depend on the other (to 0.3, measured): gains add up. All
+    groups have the same time.
+    """
+    every, n = np.append(0.0, sizes), len(groups)
+    gain = np.concatenate([np.zeros((n, 1, len(TIMES_S))), gain], axis=1)
+    # One axis for the size of each group, the last one for the time.
+    chosen = np.indices((len(every),) * n)
+    joint = sum(of[at] for of, at in zip(gain, chosen, strict=True))
+    weight = _prior(len(every), n)[..., None] * np.exp(joint - joint.max())
+    weight /= weight.sum()
+    variance = np.array([(weight * every[at][..., None] ** 2).sum((*range(n),)) for at in chosen])
+    variance = np.maximum(variance, LEAST**2 / len(TIMES_S))
     # Variance and slope at zero of the expected covariance.
     time_s = float(variance.sum() / (variance / TIMES_S).sum())
-    expected = _error(kind, math.sqrt(variance.sum()) * white, time_s)
-    return OpenError(float(none / total), expected)
+    sigmas = np.sqrt(variance.sum(axis=1)) @ np.array(groups)
+    return OpenError(float(weight[(0,) * n].sum()), _error(kind, sigmas, time_s))
+
+
+def _prior(sizes: int, groups: int) -> Array:
+    """(sizes, ...) prior probability of sizes, of which the first is none, of each group."""
+    prior = np.full((sizes,) * groups, (1.0 - NONE) * (1.0 - ALIKE) / (sizes**groups - 1))
+    alike = np.arange(1, sizes)
+    prior[(alike,) * groups] += (1.0 - NONE) * ALIKE / len(alike)
+    prior[(0,) * groups] = NONE
+    return np.asarray(prior)
 
 
 def _error(kind: str, sigmas: Array, time_s: float) -> CorrelatedError:
@@ -156,5 +174,9 @@ def _error(kind: str, sigmas: Array, time_s: float) -> CorrelatedError:
 def _covariance(evidence: Evidence, kind: str, sigmas: Array, time_s: float) -> Array:
     """(N, N) of what the LiDARs see, by an error with sigmas (3,) along the map's axes."""
     return np.asarray(
-        sum(sigmas[axis] ** 2 * evidence.slow(kind, (axis,), time_s) for axis in range(AXES))
+        sum(
+            sigma**2 * evidence.slow(kind, (axis,), time_s)
+            for axis, sigma in enumerate(sigmas.tolist())
+            if sigma
+        )
     )

@@ -30,11 +30,11 @@ from caliv_graph.calibration.open_errors import (
 )
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
-from caliv_graph.calibration.variance_components import Unknown, maximise
+from caliv_graph.calibration.variance_components import Part, Unknown, maximise
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, NoiseLevel, Registration
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD, ground_floors
-from caliv_graph.trajectory.correlated import CorrelatedError
+from caliv_graph.trajectory.correlated import GROUPS, CorrelatedError
 from caliv_graph.trajectory.noise import TYPICAL_CORRELATION_S
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
@@ -55,6 +55,11 @@ LEVELS: Mapping[str, Unknown] = {
 """White errors, a sigma each: of the registration as a factor, else in metres and radians. The
 usual figures are weak priors, a factor of ten."""
 
+CLOUD = Unknown(1.0, math.log(2.0), (1e-2, 1e2))
+"""Of one cloud's registration, as a factor on the level of all. A cloud of a few points can turn
+about the target by a hundred of its sigmas: with one level for all, that of the others was then
+eight times what it is, and hid errors of the fixes of 18 mm."""
+
 TIME = Unknown(TYPICAL_CORRELATION_S, math.log(3.0), (2.0, 300.0))
 """Correlation time in seconds: below, the error is as good as white; above, it is constant over a
 drive, which extrinsics and target take up."""
@@ -65,19 +70,17 @@ class Slow:
     """A correlated error that is looked for.
 
     Attributes:
-        groups: map axes that share a sigma.
-        sigma: of each group.
+        sigma: of each group of axes.
         starts: sigmas that the search begins with, all with each of `START_TIMES_S`.
     """
 
-    groups: tuple[tuple[int, ...], ...]
     sigma: Unknown
     starts: tuple[float, ...]
 
 
 SLOW: Mapping[str, Slow] = {
-    "gnss": Slow(((0, 1), (2,)), Unknown(5e-3, LOG_SPREAD, (1e-4, 30.0)), (5e-3, 0.02)),
-    "orientation": Slow(((0, 1, 2),), Unknown(1e-3, LOG_SPREAD, (1e-5, 0.5)), (5e-4, 2e-3)),
+    "gnss": Slow(Unknown(5e-3, LOG_SPREAD, (1e-4, 30.0)), (5e-3, 0.02)),
+    "orientation": Slow(Unknown(1e-3, LOG_SPREAD, (1e-5, 0.5)), (5e-4, 2e-3)),
 }
 """By kind of factor; the prior is that of a receiver with corrections, and of an AHRS."""
 
@@ -181,7 +184,7 @@ def _differ(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
 def _open_errors(evidence: Evidence, noise: NoiseConfig, none_from: float) -> SensorNoise:
     """The usual noise, and errors that may be there, unless none is as probable."""
     kinds = _looked_for(noise, evidence)
-    errors = open_errors(evidence, (), np.zeros(0), (), kinds, none_from)
+    errors = open_errors(evidence, (), kinds, none_from)
     opened = tuple(error.kind for error in errors)
     found = replace(_usual(noise), correlated=errors, opened=opened)
     return replace(found, levels=_levels(found, noise, ()))
@@ -206,6 +209,7 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
         "ground_distance": noise.ground_distance_m,
     }
     names = [name for name in evidence.white if given.get(name) is None]
+    names += ["registration"] * bool(evidence.clouds)
     stated = [s**2 * evidence.white[n] for n, s in given.items() if s and n in evidence.white]
     known = np.sum([evidence.observed.known, *stated], axis=0)
     evidence = replace(evidence, observed=replace(evidence.observed, known=known))
@@ -216,14 +220,15 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
         if start is None:
             break
         before = [(error.kind, _start_of(error)) for error in best.errors]
-        better = _fitted(evidence, names, [*before, start], best.white)
+        better = _fitted(evidence, names, [*before, start], best)
         if best.cost - better.cost < EVIDENCE:
             break
         best = better
         kinds.remove(start[0])
-    parts = [evidence.white[name] for name in names]
-    shown = of_expected_size(evidence, parts, best.white, best.errors)
-    opened = open_errors(evidence, parts, best.white, shown, kinds)
+    known = evidence.observed.covariance(*_white(evidence, names, best.white, best.factors))
+    evidence = replace(evidence, observed=replace(evidence.observed, known=known))
+    shown = of_expected_size(evidence, best.errors)
+    opened = open_errors(evidence, shown, kinds)
     values = dict(zip(names, best.white.tolist(), strict=True))
     normal = values.get("ground_normal", usual.floors[0])
     floors = np.array([normal, normal, values.get("ground_distance", usual.floors[2])])
@@ -294,9 +299,17 @@ def _levels(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Sigmas (k,) of the white levels, correlated errors, minus the log-posterior."""
+    """The most likely noise.
+
+    Attributes:
+        white: (k,) sigmas of the white levels.
+        factors: (J,) of the registrations of the clouds, on their level.
+        errors: that are correlated over time.
+        cost: minus the log-posterior.
+    """
 
     white: Array
+    factors: Array
     errors: tuple[CorrelatedError, ...]
     cost: float
 
@@ -305,27 +318,28 @@ def _fitted(
     evidence: Evidence,
     names: Sequence[str],
     slow: Sequence[tuple[str, Array]],
-    white: Array | None,
+    start: _Fit | None,
 ) -> _Fit:
-    """The most likely levels of `names` and of correlated errors.
+    """The most likely levels of `names`, factors of the clouds, and correlated errors.
 
     `slow` are the kinds of these, and where their search begins: sigmas of the groups, then the
-    time. `white` (k,) are the sigmas that the search of the others begins with.
+    time. That of the others begins at `start`.
     """
-    parts = [evidence.white[name] for name in names]
-    unknowns = [LEVELS[name] for name in names]
-    start = [u.median for u in unknowns] if white is None else white.tolist()
+    levels, clouds = [LEVELS[name] for name in names], [CLOUD] * len(evidence.clouds)
+    unknowns = [*levels, *clouds]
+    first = [u.median for u in unknowns] if start is None else [*start.white, *start.factors]
     for kind, values in slow:
-        unknowns += [SLOW[kind].sigma] * len(SLOW[kind].groups) + [TIME]
-        start += values.tolist()
+        unknowns += [SLOW[kind].sigma] * len(GROUPS[kind]) + [TIME]
+        first += values.tolist()
 
     def cost(x: Array) -> tuple[float, Array]:
-        return _cost(evidence, parts, [kind for kind, _ in slow], x)
+        return _cost(evidence, names, [kind for kind, _ in slow], x)
 
-    found, value = maximise(cost, unknowns, np.array(start))
-    errors, at = [], len(names)
+    found, value = maximise(cost, unknowns, np.array(first))
+    errors, at = [], len(levels) + len(clouds)
+    white, factors = found[: len(levels)], found[len(levels) : at]
     for kind, _ in slow:
-        groups = SLOW[kind].groups
+        groups = GROUPS[kind]
         sigmas = np.zeros(3)
         for group, sigma in zip(groups, found[at:], strict=False):
             sigmas[list(group)] = sigma
@@ -333,39 +347,62 @@ def _fitted(
         east, north, up = sigmas.tolist()
         errors.append(CorrelatedError(kind, (east, north, up), float(found[at])))
         at += 1
-    return _Fit(found[: len(names)], tuple(errors), value)
+    return _Fit(white, factors, tuple(errors), value)
+
+
+def _white(
+    evidence: Evidence, names: Sequence[str], sigmas: Array, factors: Array
+) -> tuple[list[Part], Array]:
+    """Parts of the covariance without correlated errors, and the logarithms of their sigmas."""
+    of_all = [name for name in names if name in evidence.white]
+    logarithms = np.log(sigmas)
+    own = np.log(factors) + logarithms[len(of_all) :]
+    parts: list[Part] = [*(evidence.white[name] for name in of_all), *evidence.clouds]
+    return parts, np.concatenate([logarithms[: len(of_all)], own])
 
 
 def _cost(
     evidence: Evidence,
-    parts: Sequence[Array],
+    names: Sequence[str],
     kinds: Sequence[str],
     x: Array,
     *,
     slopes: bool = True,
 ) -> tuple[float, Array]:
-    """Minus the log-likelihood and its derivative at logarithms x, of times by a difference."""
-    slow: list[Array] = []
-    sigmas, times = list(range(len(parts))), []
-    at = len(parts)
+    """Minus the log-likelihood and its derivative at logarithms x, of times by a difference.
+
+    x: of the levels of `names`, of the clouds' factors, and for each of `kinds` of its sigmas and
+    its time.
+    """
+    k, clouds = len(names), len(evidence.clouds)
+    parts, of_white = _white(evidence, names, np.exp(x[:k]), np.exp(x[k : k + clouds]))
+    slow: list[Part] = []
+    sigmas, times = list[int](), list[int]()
+    at = k + clouds
     for kind in kinds:
-        groups = SLOW[kind].groups
+        groups = GROUPS[kind]
         times.append(at + len(groups))
         time_s = math.exp(x[times[-1]])
         slow += [evidence.slow(kind, group, time_s) for group in groups]
         sigmas += range(at, at + len(groups))
         at = times[-1] + 1
     slope = np.zeros(len(x))
+    logarithms = np.concatenate([of_white, x[sigmas]])
     if not slopes:
-        return evidence.observed.value([*parts, *slow], x[sigmas]), slope
-    value, slope[sigmas] = evidence.observed.cost([*parts, *slow], x[sigmas])
+        return evidence.observed.value([*parts, *slow], logarithms), slope
+    value, by_part = evidence.observed.cost([*parts, *slow], logarithms)
+    of_all, of_clouds, slope[sigmas] = np.split(by_part, [len(parts) - clouds, len(parts)])
+    slope[: len(of_all)] = of_all
+    if clouds:
+        slope[k - 1] = of_clouds.sum()
+        slope[k : k + clouds] = of_clouds
     step = 1e-2
     for number, (kind, index) in enumerate(zip(kinds, times, strict=True)):
-        first = sum(len(SLOW[k].groups) for k in kinds[:number])
-        groups = SLOW[kind].groups
+        first = sum(len(GROUPS[k]) for k in kinds[:number])
+        groups = GROUPS[kind]
         later = [evidence.slow(kind, group, math.exp(x[index] + step)) for group in groups]
         changed = [*slow[:first], *later, *slow[first + len(groups) :]]
-        slope[index] = (evidence.observed.value([*parts, *changed], x[sigmas]) - value) / step
+        slope[index] = (evidence.observed.value([*parts, *changed], logarithms) - value) / step
     return value, slope
 
 
@@ -376,16 +413,16 @@ def _best_start(
 
     None: none of them explains anything.
     """
-    parts = [evidence.white[name] for name in names]
     before = [error.kind for error in best.errors]
-    logarithms = np.log(np.concatenate([best.white, *map(_start_of, best.errors)]))
-    least, out = _cost(evidence, parts, before, logarithms, slopes=False)[0], None
+    so_far = [best.white, best.factors, *map(_start_of, best.errors)]
+    logarithms = np.log(np.concatenate(so_far))
+    least, out = _cost(evidence, names, before, logarithms, slopes=False)[0], None
     for kind in kinds:
         for sigma in SLOW[kind].starts:
             for time_s in START_TIMES_S:
-                values = np.array([sigma] * len(SLOW[kind].groups) + [time_s])
+                values = np.array([sigma] * len(GROUPS[kind]) + [time_s])
                 x = np.concatenate([logarithms, np.log(values)])
-                cost = _cost(evidence, parts, [*before, kind], x, slopes=False)[0]
+                cost = _cost(evidence, names, [*before, kind], x, slopes=False)[0]
                 if cost < least:
                     least, out = cost, (kind, values)
     return out
@@ -393,7 +430,7 @@ def _best_start(
 
 def _start_of(error: CorrelatedError) -> Array:
     """Sigmas of its groups, and its time."""
-    return np.array([*(error.sigmas[g[0]] for g in SLOW[error.kind].groups), error.time_s])
+    return np.array([*(error.sigmas[g[0]] for g in GROUPS[error.kind]), error.time_s])
 
 
 def _looked_for(noise: NoiseConfig, evidence: Evidence) -> list[str]:

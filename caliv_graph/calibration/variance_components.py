@@ -16,6 +16,23 @@ MAX_STEPS = 40
 
 
 @dataclass(frozen=True)
+class Block:
+    """Errors of some residuals only.
+
+    Attributes:
+        rows: of the residuals, d in a row.
+        cov: (d, d) covariance at sigma 1.
+    """
+
+    rows: slice
+    cov: Array
+
+
+Part = Array | Block
+"""Errors of one sigma: the (N, N) covariance that they have at sigma 1, or a block of it."""
+
+
+@dataclass(frozen=True)
 class Observed:
     """Residuals that depend on parameters and on errors of known shape.
 
@@ -31,13 +48,22 @@ class Observed:
     ridge: Array
     known: Array
 
-    def cost(self, parts: Sequence[Array], logarithms: Array) -> tuple[float, Array]:
+    def covariance(self, parts: Sequence[Part], logarithms: Array) -> Array:
+        """(N, N) of all errors, at logarithms (k,) of the sigmas of `parts`."""
+        V = self.known.copy()
+        for variance, part in zip(np.exp(2.0 * logarithms), parts, strict=True):
+            if isinstance(part, Block):
+                V[part.rows, part.rows] += variance * part.cov
+            else:
+                V += variance * part
+        return V
+
+    def cost(self, parts: Sequence[Part], logarithms: Array) -> tuple[float, Array]:
         """Minus the log-likelihood, and its derivative by the logarithms (k,) of the sigmas.
 
-        `parts` (N, N) are the covariances at sigma 1. Patterson & Thompson (1971).
+        Patterson & Thompson (1971).
         """
-        variances = np.exp(2.0 * logarithms)
-        V = self.known + sum(v * part for v, part in zip(variances, parts, strict=True))
+        V = self.covariance(parts, logarithms)
         try:
             L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
         except scipy.linalg.LinAlgError:
@@ -49,15 +75,15 @@ class Observed:
         P = inverse - half.T @ half
         y = P @ self.residuals
         value = np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * self.residuals @ y
-        slope = [
-            v * (np.sum(P * part) - y @ part @ y) for v, part in zip(variances, parts, strict=True)
-        ]
-        return float(value), np.array(slope)
+        slope = np.empty(len(parts))
+        for i, part in enumerate(parts):
+            own, cov = (part.rows, part.cov) if isinstance(part, Block) else (slice(None), part)
+            slope[i] = np.sum(P[own, own] * cov) - y[own] @ cov @ y[own]
+        return float(value), np.exp(2.0 * logarithms) * slope
 
-    def value(self, parts: Sequence[Array], logarithms: Array) -> float:
+    def value(self, parts: Sequence[Part], logarithms: Array) -> float:
         """Minus the log-likelihood as `cost` has it, in a third of the time."""
-        variances = np.exp(2.0 * logarithms)
-        V = self.known + sum(v * part for v, part in zip(variances, parts, strict=True))
+        V = self.covariance(parts, logarithms)
         try:
             L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
         except scipy.linalg.LinAlgError:

@@ -7,7 +7,7 @@ derivative that of the pose in the sensor's own factors, its prior a chain (`REA
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,12 @@ AXES = 3
 
 MOVES = {"gnss": slice(3, 6), "orientation": slice(0, 3)}
 """Kind of factor -> the coordinates of the pose that an error of its sensor is taken for."""
+
+GROUPS: Mapping[str, tuple[tuple[int, ...], ...]] = {
+    "gnss": ((0, 1), (2,)),
+    "orientation": ((0, 1, 2),),
+}
+"""Kind of factor -> the map axes along which the errors of its sensor are as large."""
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from caliv_graph.calibration.sensor_noise import (
     estimated,
     noise_of_motion,
 )
-from caliv_graph.calibration.variance_components import Observed, Unknown, maximise
+from caliv_graph.calibration.variance_components import Block, Observed, Part, Unknown, maximise
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array
-from caliv_graph.trajectory.correlated import CorrelatedError
+from caliv_graph.trajectory.correlated import GROUPS, MOVES, CorrelatedError
 from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.test_variances import base, recorded, shifted, smoothed
@@ -46,7 +46,8 @@ def evidence(seed: int, heave_m: float, error: CorrelatedError | None) -> Eviden
     rng = np.random.default_rng(seed)
     n = 6 * POSES
     by_pose = np.vstack([np.eye(n), np.eye(n)])
-    registration = np.diag(np.tile([0.3e-3] * 3 + [2e-3] * 3, 2 * POSES) ** 2)
+    cloud = np.diag(np.array([0.3e-3] * 3 + [2e-3] * 3) ** 2)
+    registration = np.kron(np.eye(2 * POSES), cloud)
     known = by_pose @ np.diag(np.tile([0.2e-3] * 3 + [1e-3] * 3, POSES) ** 2) @ by_pose.T
     lift = by_pose[:, 5::6]
     effects = ErrorEffects("gnss", STAMPS, gain())
@@ -58,16 +59,19 @@ def evidence(seed: int, heave_m: float, error: CorrelatedError | None) -> Eviden
     residuals = np.linalg.cholesky(cov) @ rng.standard_normal(2 * n)
     design = np.tile(np.eye(6), (2 * POSES, 1))
     observed = Observed(residuals, design, np.full(6, 1e-2), known)
-    white = {"heave": lift @ lift.T, "registration": registration}
-    return Evidence(observed, by_pose, white, [(np.arange(n), {"gnss": effects})])
+    clouds = [Block(slice(6 * j, 6 * j + 6), cloud) for j in range(2 * POSES)]
+    drives = [(np.arange(n), {"gnss": effects})]
+    return Evidence(observed, by_pose, {"heave": lift @ lift.T}, drives, clouds=clouds)
 
 
 def test_the_slope_of_the_likelihood_is_right() -> None:
     made = evidence(0, 5e-3, None)
-    parts = [*made.white.values(), made.slow("gnss", (0, 1), 8.0)]
+    parts: list[Part] = [made.white["heave"], made.clouds[3], made.slow("gnss", (0, 1), 8.0)]
+    made.observed.known[...] += np.diag(np.full(12 * POSES, 1e-6))
     x = np.log([4e-3, 1.2, 6e-3])
-    _, slope = made.observed.cost(parts, x)
+    value, slope = made.observed.cost(parts, x)
 
+    assert made.observed.value(parts, x) == pytest.approx(value, rel=1e-12)
     for i in range(3):
         more, less = (made.observed.cost(parts, x + s * np.eye(3)[i])[0] for s in (1e-4, -1e-4))
         assert slope[i] == pytest.approx((more - less) / 2e-4, rel=1e-4, abs=1e-4)
@@ -111,6 +115,45 @@ def test_an_error_of_the_fixes_that_is_correlated_over_time_is_found() -> None:
     assert names["gnss_correlated_horizontal"].time_s == error.time_s
 
 
+def test_the_slope_of_all_levels_and_factors_of_clouds_is_right() -> None:
+    made, names = evidence(0, 5e-3, None), ["heave", "registration"]
+    rng = np.random.default_rng(1)
+    x = np.log([4e-3, 1.2, *rng.uniform(0.5, 3.0, 2 * POSES), 6e-3, 3e-3, 8.0])
+    _, slope = sensor_noise._cost(made, names, ["gnss"], x)
+
+    step = 1e-4 * np.eye(len(x))
+    for i in (0, 1, 2, 7, len(x) - 3, len(x) - 2):
+        more, less = (
+            sensor_noise._cost(made, names, ["gnss"], x + s * step[i])[0] for s in (1, -1)
+        )
+        assert slope[i] == pytest.approx((more - less) / 2e-4, rel=1e-4, abs=1e-4)
+
+
+def test_clouds_that_are_far_off_do_not_hide_an_error_of_the_fixes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Six of 32 clouds are off by ten to forty of their sigmas, as ones of a few points are."""
+    true = CorrelatedError("gnss", (0.015, 0.015, 0.01), 10.0)
+    made = evidence(2, 5e-3, true)
+    far = made.observed.residuals.copy()
+    rng = np.random.default_rng(3)
+    for j in (3, 8, 13, 17, 22, 30):
+        far[6 * j : 6 * j + 6] += (
+            20.0 * rng.standard_normal(6) * np.sqrt(np.diag(made.clouds[j].cov))
+        )
+
+    made = replace(made, observed=replace(made.observed, residuals=far))
+
+    found = estimated(made, NoiseConfig())
+
+    (error,) = found.correlated
+    assert error.sigmas[0] == pytest.approx(true.sigmas[0], rel=0.4)
+    assert found.heave_m == pytest.approx(5e-3, rel=0.35)
+    # As if all clouds were as good.
+    monkeypatch.setattr(sensor_noise, "CLOUD", Unknown(1.0, 1e-3, (0.99, 1.01)))
+    assert estimated(made, NoiseConfig()).correlated == ()
+
+
 def test_an_error_that_the_lidars_neither_show_nor_rule_out_is_called_open() -> None:
     white_m = 5e-3
     made = replace(evidence(2, 5e-3, None), sensor_sigmas={"gnss": np.full(3, white_m)})
@@ -123,7 +166,7 @@ def test_an_error_that_the_lidars_neither_show_nor_rule_out_is_called_open() -> 
     sources = {level.name: level.source for level in found.levels}
     assert sources["gnss_correlated_vertical"] == OPEN
     assert estimated(made, NoiseConfig(gnss_correlated_horizontal_m=0.0)).correlated == ()
-    precise = replace(made, sensor_sigmas={"gnss": np.full(3, 0.05)})
+    precise = replace(made, sensor_sigmas={"gnss": np.full(3, 0.2)})
     assert estimated(precise, NoiseConfig()).correlated == ()  # it would show
 
 
@@ -171,8 +214,9 @@ def test_levels_of_the_config_are_kept() -> None:
 
 
 def test_every_axis_of_an_error_has_a_sigma() -> None:
-    for slow in SLOW.values():
-        assert sorted(axis for group in slow.groups for axis in group) == [0, 1, 2]
+    assert GROUPS.keys() == SLOW.keys() == MOVES.keys()
+    for groups in GROUPS.values():
+        assert sorted(axis for group in groups for axis in group) == [0, 1, 2]
     assert all(
         low < level.median < high for level in LEVELS.values() for low, high in [level.bounds]
     )

@@ -26,6 +26,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process per c
 
 import numpy as np
 
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
+
 from caliv_graph.common.exits import exit_code
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
@@ -38,10 +41,11 @@ from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.uncertainty.evaluation import evaluate
+from scripts._given_poses import given_poses, stamps_of
 
-FOLDER = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
+FOLDER = REPOSITORY / "configs" / "scenarios"
 
-POSE_PERIOD_NS, POSE_SIGMAS = 20_000_000, np.repeat([5e-4, 5e-3], 3)
+POSE_SIGMAS = np.repeat([5e-4, 5e-3], 3)
 
 EXACT = {
     "gnss": {"time_offset_sigma_s": 0.0},
@@ -88,11 +92,9 @@ class Late(ForwardingRecording):
     def _poses(self, late_ns: int) -> GivenPoses:
         drive = self.recording
         assert isinstance(drive, SimulatedRecording)
-        stamps = np.arange(drive.truth.start_ns, drive.truth.end_ns, POSE_PERIOD_NS)
-        errors = np.random.default_rng(drive.seed).normal(0.0, POSE_SIGMAS, (len(stamps), 6))
-        truth = drive.truth.T_map_vehicle(stamps)
-        poses = [T.retract(e) for T, e in zip(truth, errors, strict=True)]
-        return GivenPoses(stamps + late_ns, tuple(poses))
+        n = len(stamps_of(drive))
+        errors = np.random.default_rng(drive.seed).normal(0.0, POSE_SIGMAS, (n, 6))
+        return given_poses(drive, errors, late_ns)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import gtsam
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
+from caliv_graph.calibration.given_noise import noise_by_structure
 from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.linear import linearise_clouds
@@ -113,9 +114,13 @@ def estimate_with_noise(
                 told = structure.slow_errors(trajectories, guesses, {}, config)
                 noise = noise_of_motion(trajectories, config.noise, told.of_drives)
                 start = told.T_vehicle_lidar or guesses
+                poses, stamps_ns = structure.pose_errors(trajectories, start, config)
+                pose_noise = noise_by_structure(poses, stamps_ns, trajectories, config)
+                start = poses.T_vehicle_lidar or start
+                told = told if told.T_vehicle_lidar else poses
                 trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
             solved = solve_structure_and_ground(
-                trajectories, config, progress, grounds, structure, noise, told
+                trajectories, config, progress, grounds, structure, noise, told, pose_noise
             )
             return solution_without_target(solved), trajectories
     if config.solve.mode == "staged":

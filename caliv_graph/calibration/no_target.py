@@ -49,7 +49,14 @@ from caliv_graph.calibration.structure_evidence import (
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError
-from caliv_graph.products import Array, GroundObservation, Iteration, Solution, StructureTerm
+from caliv_graph.products import (
+    Array,
+    GroundObservation,
+    Iteration,
+    PoseNoise,
+    Solution,
+    StructureTerm,
+)
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.wording.offsets import undetermined_offset_sentences
 
@@ -98,6 +105,7 @@ def solve_structure_and_ground(
     structure: StructureEvidence,
     noise: SensorNoise | None = None,
     told: ToldErrors = NOTHING_TOLD,
+    pose_noise: PoseNoise | None = None,
 ) -> StructureSolve:
     """Solves for the extrinsics by structure and ground.
 
@@ -109,6 +117,7 @@ def solve_structure_and_ground(
         structure: the patches.
         noise: of the drives; None: the usual figures.
         told: what a rough solve of the structure said of the sensors' errors.
+        pose_noise: of given poses; None: the usual figures.
 
     Raises:
         TargetError: structure says nothing, or the mode is the paper's, which needs a target.
@@ -117,6 +126,7 @@ def solve_structure_and_ground(
     if config.solve.mode == "staged":
         raise TargetError("solve.mode staged needs a target", "Set it to auto or joint")
     noise = noise or usual_noise(config.noise)
+    pose_noise = pose_noise or first_pose_noise(config.noise)
     kept = kept_stamps(structure.patches)
     guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
     begun = time.perf_counter()
@@ -127,7 +137,7 @@ def solve_structure_and_ground(
             told.T_vehicle_lidar or guesses,
             {},
             noise.heave_m,
-            first_pose_noise(config.noise),
+            pose_noise,
             config,
             aligned=told.aligned,
         )
@@ -144,7 +154,7 @@ def solve_structure_and_ground(
     stamps = {term.drive: term.stamps_ns for term in terms}
     problem = pose_problem([], trajectories, config, noise.heave_m, others, stamps)
     with progress.stage("solving the graph", COUPLED_STEPS) as advance:
-        loop = _Loop(problem, terms, grounds, config)
+        loop = _Loop(problem, terms, grounds, config, pose_noise)
         loop.solve(advance)
         if has_clock(problem):
             loop.again(under_clock_prior(loop.state, loop.reduced, loop.undetermined), advance)
@@ -197,6 +207,7 @@ class _Loop:
         terms: tuple[StructureTerm, ...],
         grounds: tuple[GroundObservation, ...],
         config: Config,
+        pose_noise: PoseNoise,
     ) -> None:
         """At the extrinsics of the terms."""
         start = nearest_extrinsics({}, terms)
@@ -204,7 +215,7 @@ class _Loop:
             problem=problem,
             config=config,
             values=initial_values(problem, [], start),
-            noise=first_pose_noise(config.noise),
+            noise=pose_noise,
             scale=1.0,
             weights=RobustWeights(config.robust, 0),
             motion=motion_graph(problem),

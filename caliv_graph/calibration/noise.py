@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, replace
 
 import gtsam
 import numpy as np
 import scipy.linalg
-from scipy.linalg.lapack import dpotrf, dtrtrs
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import minimize_scalar
 
 from caliv_graph.calibration.graph import with_given_poses
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
@@ -29,6 +28,14 @@ from caliv_graph.calibration.pose_effects import (
 )
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.robust import own_blocks
+from caliv_graph.calibration.variance_components import (
+    Block,
+    Component,
+    Likelihood,
+    Observed,
+    Unknown,
+    maximise,
+)
 from caliv_graph.calibration.vehicle_parameters import KEYS, POSE_TIME_OFFSET
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.conventions import key_pose_error, key_vehicle
@@ -39,20 +46,34 @@ TYPICAL = PoseNoise(
     white_position_m=2e-3,
     drift_rotation_rad=3e-4,
     drift_position_m=3e-3,
-    drift_time_s=4.0,
+    drift_time_s=10.0,
 )
 """Median of the prior: the filter of a good GNSS/INS."""
+
+LOG_SPREAD = math.log(10.0)
+"""1 sigma of the log-normal prior about the sigmas of `TYPICAL`: a factor of ten."""
+
+TIME_SPREAD = math.log(3.0)
+"""The same about its time."""
+
+TIMES_S: tuple[float, ...] = (1.0, 3.0, 10.0, 30.0, 100.0)
+"""Correlation times that are tried: a drive hardly tells them apart."""
+
+FLOORS = (2e-5, 2e-4, 1e-5, 1e-4)
+"""Smallest values: rotation rad, position m (white, Gauss-Markov)."""
+
+CEILINGS = (0.05, 1.0, 0.1, 2.0)
 
 TYPICAL_SCALE = 1.0
 """Median of the prior of the scale on the registration's sigmas."""
 
-LOG_SPREAD = math.log(10.0)
-"""1 sigma of the log-normal prior about `TYPICAL`: a factor of ten."""
+SCALE = Unknown(TYPICAL_SCALE, LOG_SPREAD, (0.5, 10.0))
+"""Scale on the registration's sigmas."""
 
-FLOORS = np.array([2e-5, 2e-4, 1e-5, 1e-4, 0.5])
-"""Smallest values: rotation rad, position m (white, Gauss-Markov), scale."""
-
-CEILINGS = np.array([0.05, 1.0, 0.1, 2.0, 10.0])
+CLOUD = Unknown(1.0, math.log(2.0), (1e-2, 1e2))
+"""Of one cloud's registration, as a factor on the level of all. A cloud of a few points can turn
+about the target by a hundred of its sigmas: with one level for all, that of the others was then
+eight times what it is, and hid errors of the fixes of 18 mm."""
 
 KNOWN_PART = 1e-9
 """Eigenvalues of the joint information below this part of the largest are those of the gauge."""
@@ -67,19 +88,19 @@ GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 
 
 def _configured(noise: NoiseConfig) -> list[float | None]:
-    """The values of the config in SI units, in the order of the parameters."""
+    """The sigmas of the config in SI units, in the order of `PoseNoise`."""
     white, drift = (
         None if v is None else math.radians(v)
         for v in (noise.pose_rotation_deg, noise.pose_drift_rotation_deg)
     )
-    return [white, noise.pose_position_m, drift, noise.pose_drift_position_m, None]
+    return [white, noise.pose_position_m, drift, noise.pose_drift_position_m]
 
 
 def first_pose_noise(noise: NoiseConfig) -> PoseNoise:
     """The values of the config, and `TYPICAL` for the others."""
-    typical = astuple(TYPICAL)
+    *typical, time_s = astuple(TYPICAL)
     values = [t if g is None else g for g, t in zip(_configured(noise), typical, strict=True)]
-    return PoseNoise(values[0], values[1], values[2], values[3], noise.pose_drift_time_s)
+    return PoseNoise(values[0], values[1], values[2], values[3], noise.pose_drift_time_s or time_s)
 
 
 def sound_clouds(
@@ -135,35 +156,93 @@ def fit_pose_noise(
             have taken up the errors that are to be measured.
         config: what is given there is kept.
     """
-    first = first_pose_noise(config)
-    likelihood = _RestrictedLikelihood.at(problem, measured, information, sound, values, first)
-    # What the config states is kept; without given poses there are no pose errors to estimate.
-    free = np.array([g is None for g in _configured(config)])
-    fitted = problem.given() & ~problem.stated()
-    free &= np.array([fitted.any()] * 2 + [problem.given().any()] * 2 + [True])
-
-    def logarithms(x: Array) -> Array:
-        full = likelihood.prior.copy()
-        full[free] = x
-        return full
-
-    def cost(x: Array) -> float:
-        return likelihood.cost(logarithms(x))
-
-    found = minimize(
-        cost,
-        likelihood.prior[free],
-        # Nelder-Mead stops short in the valleys between white and Gauss-Markov errors.
-        method="Powell",
-        options={"maxfev": 300, "xtol": 1e-2, "ftol": 1e-5},
+    chosen = evenly_over_drives(problem, sound)
+    r, A, B = _stacked(problem, linearise_clouds(problem, values), measured, values, chosen)
+    known, white, slow = pose_parts(problem, values, chosen, B)
+    observed = Observed(r, A, np.diagonal(_ridge(problem, A.shape[1])), known)
+    clouds = [
+        Block(slice(6 * row, 6 * row + 6), cov)
+        for row, cov in enumerate(np.linalg.inv(information[chosen]))
+    ]
+    given, stated = problem.given(), problem.stated()
+    of_messages = None
+    if problem.stated_cov is not None and stated.any() and not (given & ~stated).any():
+        of_messages = problem.stated_cov[stated]
+    noise, scale = expected_noise(
+        observed,
+        white,
+        slow,
+        config,
+        clouds=clouds,
+        open_levels=(bool((given & ~stated).any()), bool(given.any())),
+        of_messages=of_messages,
     )
-    bounded = np.clip(logarithms(found.x), np.log(FLOORS), np.log(CEILINGS))
-    value = np.exp(bounded).tolist()
-    if problem.stated_cov is not None and problem.stated().any() and not fitted.any():
-        variances = np.diagonal(problem.stated_cov[problem.stated()], axis1=1, axis2=2)
-        value[:2] = np.sqrt([variances[:, :3].mean(), variances[:, 3:].mean()]).tolist()
-    noise = PoseNoise(value[0], value[1], value[2], value[3], first.drift_time_s)
-    return noise, float(value[4])
+    # Solves by all clouds need one scale: a factor for each is for the poses' noise.
+    poses = pose_covariance(problem, values, chosen, B, noise)
+    alike = Likelihood(replace(observed, known=poses), [Component(cloud, (0,)) for cloud in clouds])
+    of_all, _ = maximise(alike.cost, [SCALE], np.array([scale]))
+    return noise, float(of_all[0])
+
+
+def expected_noise(
+    observed: Observed,
+    white: tuple[Array, Array],
+    slow: Callable[[float], tuple[Array, Array]],
+    config: NoiseConfig,
+    *,
+    clouds: Sequence[Block] = (),
+    open_levels: tuple[bool, bool] = (True, True),
+    of_messages: Array | None = None,
+) -> tuple[PoseNoise, float]:
+    """The noise of given poses by residuals that it moves; and the scale of the registration's.
+
+    A drive hardly tells the correlation time. Sigmas are fitted at some times; the result has the
+    expected variances, and the same change over short times. Over any time the errors then change
+    by at least as much as these hypotheses together (Jensen).
+
+    Args:
+        observed: the residuals.
+        white: their covariances (N, N) by white errors, rotation and position, at sigma 1.
+        slow: the same of Gauss-Markov errors of a correlation time in seconds.
+        config: what is stated there is kept.
+        clouds: registrations of clouds among the residuals.
+        open_levels: whether white and whether Gauss-Markov sigmas are to be found; else `TYPICAL`.
+        of_messages: (n, 6, 6) white errors of all poses, if messages state them.
+    """
+    fixed, unknowns = _configured(config), list[Unknown]()
+    needed = np.repeat(open_levels, 2).tolist()
+    for need, value, median, low, high in zip(
+        needed, fixed, astuple(TYPICAL)[:4], FLOORS, CEILINGS, strict=True
+    ):
+        kept = median if value is None else value
+        free = need and value is None
+        unknowns.append(Unknown(kept, LOG_SPREAD, (low, high) if free else (kept, kept)))
+    scale = len(unknowns)
+    unknowns += [SCALE, *([CLOUD] * len(clouds))]
+    of_clouds = [Component(of, (scale, scale + 1 + row)) for row, of in enumerate(clouds)]
+    time_s = config.pose_drift_time_s or TYPICAL.drift_time_s
+    given_time = config.pose_drift_time_s is not None or not open_levels[1]
+    times_s = np.array([time_s] if given_time else TIMES_S)
+    found, costs = np.array([u.median for u in unknowns]), np.zeros(len(times_s))
+    variances = np.zeros((len(times_s), scale))
+    for row, time in enumerate(times_s.tolist()):
+        parts = [Component(part, (number,)) for number, part in enumerate((*white, *slow(time)))]
+        likelihood = Likelihood(observed, [*parts, *of_clouds])
+        found, cost = maximise(likelihood.cost, unknowns, found)
+        surprise = math.log(time / TYPICAL.drift_time_s) / TIME_SPREAD
+        costs[row], variances[row] = cost + 0.5 * surprise**2, found[:scale] ** 2
+    weight = np.exp(costs.min() - costs)
+    weight /= weight.sum()
+    expected = weight @ variances
+    if of_messages is not None:
+        of_each = np.diagonal(of_messages, axis1=1, axis2=2)
+        expected[:2] = of_each[:, :3].mean(), of_each[:, 3:].mean()
+    if not given_time:
+        drift = weight[:, None] * variances[:, 2:] / np.square(astuple(TYPICAL)[2:4])
+        time_s = float(drift.sum() / (drift.sum(axis=1) / times_s).sum())
+    fits = zip(fixed, np.sqrt(expected).tolist(), strict=True)
+    a, b, c, d = (fit if value is None else value for value, fit in fits)
+    return PoseNoise(a, b, c, d, time_s), float(found[scale])
 
 
 def fit_scale(
@@ -218,79 +297,10 @@ def fit_scale(
             + 0.5 * (z @ (weight * z) - pull @ pull - np.log(weight).sum() + surprise)
         )
 
-    bounds = (math.log(FLOORS[-1]), math.log(CEILINGS[-1]))
+    low, high = SCALE.bounds
+    bounds = (math.log(low), math.log(high))
     found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-2})
     return math.exp(float(found.x))
-
-
-@dataclass(frozen=True)
-class _RestrictedLikelihood:
-    """The restricted likelihood of the noise levels of m clouds, with its prior.
-
-    Attributes:
-        stacked: (6m, p + 1) derivatives of the residuals of the clouds with respect to extrinsics,
-            targets and time offsets, and the residuals at the given poses.
-        known: (36 m^2,) covariance (6m, 6m) that smoothed poses bring, and the stated white errors.
-        parts: (5, 36 m^2) what the variances multiply: white rotation and position, Gauss-Markov
-            rotation and position, registration.
-        ridge: (p, p) weak information on what the design multiplies.
-        prior: (5,) medians of the prior on the logarithms of the sigmas.
-    """
-
-    stacked: Array
-    known: Array
-    parts: Array
-    ridge: Array
-    prior: Array
-
-    @classmethod
-    def at(
-        cls,
-        problem: Problem,
-        measured: Sequence[gtsam.Pose3],
-        information: Array,
-        sound: BoolArray,
-        values: gtsam.Values,
-        first: PoseNoise,
-    ) -> _RestrictedLikelihood:
-        """Linearised at `values`; arguments as in `fit_pose_noise`."""
-        chosen = evenly_over_drives(problem, sound)
-        lines = linearise_clouds(problem, values)
-        r, A, B = _stacked(problem, lines, measured, values, chosen)
-        known, parts = pose_parts(problem, values, chosen, B, first)
-        of_clouds = scipy.linalg.block_diag(*np.linalg.inv(information[chosen]))
-        return cls(
-            stacked=np.asfortranarray(np.column_stack([A, r])),
-            known=known.ravel(),
-            parts=np.array([part.ravel() for part in (*parts, of_clouds)]),
-            ridge=_ridge(problem, A.shape[1]),
-            prior=np.log([*astuple(first)[:4], TYPICAL_SCALE]),
-        )
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(6m, 6m)."""
-        return len(self.stacked), len(self.stacked)
-
-    def cost(self, logarithms: Array) -> float:
-        """Minus the logarithm of likelihood times prior, of the logarithms (5,) of the sigmas."""
-        scale = np.exp(2.0 * np.clip(logarithms, np.log(FLOORS), np.log(CEILINGS)))
-        # LAPACK itself: this runs hundreds of times, and scipy's checks take as long. V is
-        # symmetric, and its transpose is in LAPACK's order.
-        L, failed = dpotrf((self.known + scale @ self.parts).reshape(self.shape).T, lower=1)
-        if failed:
-            return 1e12
-        white, _ = dtrtrs(L, self.stacked, lower=1)
-        A, r = white[:, :-1], white[:, -1]
-        LN, failed = dpotrf(A.T @ A + self.ridge, lower=1)
-        if failed:
-            return 1e12
-        y, _ = dtrtrs(LN, A.T @ r, lower=1)
-        misfit = r @ r - y @ y
-        surprise = np.sum(((logarithms - self.prior) / LOG_SPREAD) ** 2)
-        return float(
-            np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * (misfit + surprise)
-        )
 
 
 def evenly_over_drives(problem: Problem, sound: BoolArray, most: int | None = None) -> IntArray:

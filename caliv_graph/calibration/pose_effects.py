@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import astuple
 
 import gtsam
@@ -14,20 +15,19 @@ from caliv_graph.products import Array, IntArray, PoseNoise
 
 
 def pose_parts(
-    problem: Problem, values: gtsam.Values, chosen: IntArray, B: Array, noise: PoseNoise
-) -> tuple[Array, tuple[Array, ...]]:
+    problem: Problem, values: gtsam.Values, chosen: IntArray, B: Array
+) -> tuple[Array, tuple[Array, Array], Callable[[float], tuple[Array, Array]]]:
     """What pose errors do to the residuals of m clouds: (6m, 6m) covariances.
 
-    That of smoothed poses and stated white errors; and what the variances of white rotation and
-    position, Gauss-Markov rotation and position multiply. B (m, 6, 6) are the effects of pose
-    errors, `noise` has the time of the Gauss-Markov part.
+    That of smoothed poses and stated white errors; what the variances of white rotation and
+    position multiply; and what those of Gauss-Markov rotation and position do, by their time in
+    seconds. B (m, 6, 6) are the effects of pose errors.
     """
     times = problem.times_s()[problem.cloud_pose[chosen]]
     drives = problem.drives()[problem.cloud_pose[chosen]]
     apart = np.abs(times[:, None] - times[None])
     together = drives[:, None] == drives[None]
     same = ((apart < 1e-9) & together).astype(np.float64)
-    slow = np.where(together, np.exp(-apart / noise.drift_time_s), 0.0)
     joint = motion_covariance(problem, values, chosen, together=True)
     known = np.einsum("pax,pqxy,qby->paqb", B, joint, B, optimize=True)
     known += stated_effect(problem, B, chosen, same)
@@ -35,22 +35,26 @@ def pose_parts(
     unstated = ~problem.stated()[problem.cloud_pose[chosen]]
     B = B * problem.given()[problem.cloud_pose[chosen]][:, None, None]
     effect = [B[:, :, :3].reshape(-1, 3), B[:, :, 3:].reshape(-1, 3)]
-    spread = [e @ e.T for e in effect]
-    same = same * np.outer(unstated, unstated)
+    rotation, position = (e @ e.T for e in effect)
     ones = np.ones((6, 6))
-    return known.reshape(6 * len(chosen), 6 * len(chosen)), (
-        spread[0] * np.kron(same, ones),
-        spread[1] * np.kron(same, ones),
-        spread[0] * np.kron(slow, ones),
-        spread[1] * np.kron(slow, ones),
-    )
+
+    def of_both(correlation: Array) -> tuple[Array, Array]:
+        every = np.kron(correlation, ones)
+        return rotation * every, position * every
+
+    def slow(time_s: float) -> tuple[Array, Array]:
+        return of_both(np.where(together, np.exp(-apart / time_s), 0.0))
+
+    white = of_both(same * np.outer(unstated, unstated))
+    return known.reshape(6 * len(chosen), 6 * len(chosen)), white, slow
 
 
 def pose_covariance(
     problem: Problem, values: gtsam.Values, chosen: IntArray, B: Array, noise: PoseNoise
 ) -> Array:
     """(6m, 6m) covariance of the residuals of m clouds by pose errors; see `pose_parts`."""
-    known, parts = pose_parts(problem, values, chosen, B, noise)
+    known, white, slow = pose_parts(problem, values, chosen, B)
+    parts = (*white, *slow(noise.drift_time_s))
     for sigma, part in zip(astuple(noise)[:4], parts, strict=True):
         known = known + sigma**2 * part
     return np.asarray(known)

@@ -133,6 +133,16 @@ def _offset(prior: ParameterPrior, value: ParameterValue) -> Array:
 def _given(
     trajectory: GivenTrajectory, stamps_ns: IntArray, noise: PoseNoise, config: Config
 ) -> PosePrior:
+    """`given_prior`, and the clock of the poses, which is a parameter."""
+    prior, clock = given_prior(trajectory, stamps_ns, noise, config), pose_clock_prior(config)
+    if clock is None:
+        return prior
+    return _with_clock(prior, late_twists(trajectory, prior.stamps_ns.tolist()), clock)
+
+
+def given_prior(
+    trajectory: GivenTrajectory, stamps_ns: IntArray, noise: PoseNoise, config: Config
+) -> PosePrior:
     """White and Gauss-Markov errors of given poses: rotation in vehicle, position in map axes."""
     stamps = np.asarray(stamps_ns, np.int64)
     R, t = trajectory.poses_at(stamps)
@@ -160,11 +170,7 @@ def _given(
     information[:, 3:] = np.einsum("iba,ibjk->iajk", R, information[:, 3:])
     information[..., 3:] = np.einsum("jba,ikjb->ikja", R, information[..., 3:])
     flat = information.reshape(6 * m, 6 * m)
-    prior = _on_poses(stamps, unstack(R, t), flat, np.zeros(6 * m))
-    clock = pose_clock_prior(config)
-    if clock is None:
-        return prior
-    return _with_clock(prior, late_twists(trajectory, stamps.tolist()), clock)
+    return _on_poses(stamps, unstack(R, t), flat, np.zeros(6 * m))
 
 
 def _with_clock(prior: PosePrior, twists: Array, clock: ParameterPrior) -> PosePrior:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from caliv_graph.calibration.evidence import (
     linearised_evidence,
     motion_evidence,
 )
-from caliv_graph.calibration.noise import LOG_SPREAD
+from caliv_graph.calibration.noise import CLOUD, LOG_SPREAD
 from caliv_graph.calibration.open_errors import (
     RATHER_NONE,
     SIZES,
@@ -30,7 +31,13 @@ from caliv_graph.calibration.open_errors import (
 )
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
-from caliv_graph.calibration.variance_components import Part, Unknown, maximise
+from caliv_graph.calibration.variance_components import (
+    Component,
+    Likelihood,
+    SlowComponent,
+    Unknown,
+    maximise,
+)
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, NoiseLevel, Registration
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD, ground_floors
@@ -54,11 +61,6 @@ LEVELS: Mapping[str, Unknown] = {
 }
 """White errors, a sigma each: of the registration as a factor, else in metres and radians. The
 usual figures are weak priors, a factor of ten."""
-
-CLOUD = Unknown(1.0, math.log(2.0), (1e-2, 1e2))
-"""Of one cloud's registration, as a factor on the level of all. A cloud of a few points can turn
-about the target by a hundred of its sigmas: with one level for all, that of the others was then
-eight times what it is, and hid errors of the fixes of 18 mm."""
 
 TIME = Unknown(TYPICAL_CORRELATION_S, math.log(3.0), (2.0, 300.0))
 """Correlation time in seconds: below, the error is as good as white; above, it is constant over a
@@ -225,7 +227,8 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
             break
         best = better
         kinds.remove(start[0])
-    known = evidence.observed.covariance(*_white(evidence, names, best.white, best.factors))
+    all_white = np.log(np.concatenate([best.white, best.factors]))
+    known = _likelihood(evidence, names, ()).covariance(all_white)
     evidence = replace(evidence, observed=replace(evidence.observed, known=known))
     shown = of_expected_size(evidence, best.errors)
     opened = open_errors(evidence, shown, kinds)
@@ -332,10 +335,8 @@ def _fitted(
         unknowns += [SLOW[kind].sigma] * len(GROUPS[kind]) + [TIME]
         first += values.tolist()
 
-    def cost(x: Array) -> tuple[float, Array]:
-        return _cost(evidence, names, [kind for kind, _ in slow], x)
-
-    found, value = maximise(cost, unknowns, np.array(first))
+    likelihood = _likelihood(evidence, names, [kind for kind, _ in slow])
+    found, value = maximise(likelihood.cost, unknowns, np.array(first))
     errors, at = [], len(levels) + len(clouds)
     white, factors = found[: len(levels)], found[len(levels) : at]
     for kind, _ in slow:
@@ -350,60 +351,28 @@ def _fitted(
     return _Fit(white, factors, tuple(errors), value)
 
 
-def _white(
-    evidence: Evidence, names: Sequence[str], sigmas: Array, factors: Array
-) -> tuple[list[Part], Array]:
-    """Parts of the covariance without correlated errors, and the logarithms of their sigmas."""
-    of_all = [name for name in names if name in evidence.white]
-    logarithms = np.log(sigmas)
-    own = np.log(factors) + logarithms[len(of_all) :]
-    parts: list[Part] = [*(evidence.white[name] for name in of_all), *evidence.clouds]
-    return parts, np.concatenate([logarithms[: len(of_all)], own])
+def _likelihood(evidence: Evidence, names: Sequence[str], kinds: Sequence[str]) -> Likelihood:
+    """Of errors of the named levels, of the clouds and of `kinds`.
 
-
-def _cost(
-    evidence: Evidence,
-    names: Sequence[str],
-    kinds: Sequence[str],
-    x: Array,
-    *,
-    slopes: bool = True,
-) -> tuple[float, Array]:
-    """Minus the log-likelihood and its derivative at logarithms x, of times by a difference.
-
-    x: of the levels of `names`, of the clouds' factors, and for each of `kinds` of its sigmas and
-    its time.
+    Unknowns: the levels, the clouds' factors, and of each kind its sigmas and its time.
     """
-    k, clouds = len(names), len(evidence.clouds)
-    parts, of_white = _white(evidence, names, np.exp(x[:k]), np.exp(x[k : k + clouds]))
-    slow: list[Part] = []
-    sigmas, times = list[int](), list[int]()
-    at = k + clouds
+    level = {name: number for number, name in enumerate(names)}
+    white = [Component(of, (level[n],)) for n, of in evidence.white.items() if n in level]
+    clouds = [
+        Component(cloud, (level["registration"], len(names) + j))
+        for j, cloud in enumerate(evidence.clouds)
+    ]
+    slow, at = [], len(names) + len(clouds)
     for kind in kinds:
-        groups = GROUPS[kind]
-        times.append(at + len(groups))
-        time_s = math.exp(x[times[-1]])
-        slow += [evidence.slow(kind, group, time_s) for group in groups]
-        sigmas += range(at, at + len(groups))
-        at = times[-1] + 1
-    slope = np.zeros(len(x))
-    logarithms = np.concatenate([of_white, x[sigmas]])
-    if not slopes:
-        return evidence.observed.value([*parts, *slow], logarithms), slope
-    value, by_part = evidence.observed.cost([*parts, *slow], logarithms)
-    of_all, of_clouds, slope[sigmas] = np.split(by_part, [len(parts) - clouds, len(parts)])
-    slope[: len(of_all)] = of_all
-    if clouds:
-        slope[k - 1] = of_clouds.sum()
-        slope[k : k + clouds] = of_clouds
-    step = 1e-2
-    for number, (kind, index) in enumerate(zip(kinds, times, strict=True)):
-        first = sum(len(GROUPS[k]) for k in kinds[:number])
-        groups = GROUPS[kind]
-        later = [evidence.slow(kind, group, math.exp(x[index] + step)) for group in groups]
-        changed = [*slow[:first], *later, *slow[first + len(groups) :]]
-        slope[index] = (evidence.observed.value([*parts, *changed], logarithms) - value) / step
-    return value, slope
+        time = at + len(GROUPS[kind])
+        slow.append(SlowComponent(partial(_slow, evidence, kind), (*range(at, time),), time))
+        at = time + 1
+    return Likelihood(evidence.observed, [*white, *clouds], slow)
+
+
+def _slow(evidence: Evidence, kind: str, time_s: float) -> list[Array]:
+    """(N, N) by an error of unit sigma of each group of axes."""
+    return [evidence.slow(kind, group, time_s) for group in GROUPS[kind]]
 
 
 def _best_start(
@@ -416,13 +385,14 @@ def _best_start(
     before = [error.kind for error in best.errors]
     so_far = [best.white, best.factors, *map(_start_of, best.errors)]
     logarithms = np.log(np.concatenate(so_far))
-    least, out = _cost(evidence, names, before, logarithms, slopes=False)[0], None
+    least, out = _likelihood(evidence, names, before).value(logarithms), None
     for kind in kinds:
+        likelihood = _likelihood(evidence, names, [*before, kind])
         for sigma in SLOW[kind].starts:
             for time_s in START_TIMES_S:
                 values = np.array([sigma] * len(GROUPS[kind]) + [time_s])
                 x = np.concatenate([logarithms, np.log(values)])
-                cost = _cost(evidence, names, [*before, kind], x, slopes=False)[0]
+                cost = likelihood.value(x)
                 if cost < least:
                     least, out = cost, (kind, values)
     return out

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.pose_priors import plain_prior, pose_priors
+from caliv_graph.calibration.pose_priors import given_prior, plain_prior, pose_priors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
 from caliv_graph.calibration.solve import SolveState, offset_sigmas, solve_registered
 from caliv_graph.calibration.structure import nearest_extrinsics
@@ -26,15 +28,34 @@ from caliv_graph.products import (
 from caliv_graph.registration.symmetry import Symmetry
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.slow_errors import place_all, scans_for_errors
+from caliv_graph.structure.slow_errors import (
+    Tell,
+    place_all,
+    scans_for_errors,
+    told_of_errors,
+    told_of_poses,
+)
 from caliv_graph.trajectory.effects import poses_and_gain
 from caliv_graph.trajectory.error_likelihood import likelihood_end_ns
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
 KEPT_POSES = 40
 """Poses of a drive without a target that the calibration keeps, for the ground: spread over the
 drive, their views of it differ. All other poses of its structure are eliminated before."""
+
+MOST_GIVEN = 50
+"""Given poses of a drive that its structure tells the errors of: the cost grows with their cube."""
+
+LOOSE = PoseNoise(
+    white_rotation_rad=1e-3,
+    white_position_m=0.01,
+    drift_rotation_rad=2e-3,
+    drift_position_m=0.03,
+    drift_time_s=10.0,
+)
+"""Noise of given poses under which structure is solved before it is known: as much as poses are
+worth using, so that it does not pass for relief of the walls."""
 
 StructureTerms = Callable[
     [
@@ -61,7 +82,7 @@ SlowErrors = Callable[
     [
         Sequence[DrivePatches],
         Sequence[PosePrior],
-        Sequence[Array],
+        Sequence[Tell],
         Sequence[VehicleTrajectory],
         Mapping[str, gtsam.Pose3],
         Mapping[str, gtsam.Pose3],
@@ -70,17 +91,17 @@ SlowErrors = Callable[
     ],
     tuple[tuple[tuple[Array, Array] | None, ...], Mapping[str, gtsam.Pose3]],
 ]
-"""Patches, priors of their poses, gains of these on errors of sensors and trajectory of each drive;
-rough extrinsics, those of them that a target has placed, config, 1 sigma of the heave -> per drive
-information and gradient on the errors, and better extrinsics."""
+"""Patches, priors of their poses, what is asked and trajectory of each drive; rough extrinsics,
+those of them that a target has placed, config, 1 sigma of the heave -> per drive information and
+gradient on the errors, and better extrinsics."""
 
 
 @dataclass(frozen=True)
 class ToldErrors:
-    """What structure says of slow errors of the vehicle's sensors.
+    """What structure says of errors of the vehicle's sensors or poses.
 
     Attributes:
-        of_drives: drive -> information and gradient, as those of `ErrorLikelihood`.
+        of_drives: drive -> information and gradient.
         T_vehicle_lidar: of every LiDAR, where the strips of these drives lie on each other; None:
             no drive has any.
         aligned: whether they do so for the LiDARs of all drives; else this is only a start.
@@ -97,6 +118,16 @@ def no_terms(*_: object) -> tuple[StructureTerm, ...]:
 
 
 NOTHING_TOLD = ToldErrors()
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A drive whose structure is asked for errors: patches of some scans, prior, what is asked."""
+
+    patches: DrivePatches
+    prior: PosePrior
+    tell: Tell
+    trajectory: VehicleTrajectory
 
 
 @dataclass(frozen=True)
@@ -127,10 +158,8 @@ class StructureEvidence:
         Raises:
             SolveError: it could not be solved.
         """
-        if self.errors is None:
-            return NOTHING_TOLD
         heave_m = config.noise.heave_m or HEAVE_SIGMA_M
-        of_drives: list[tuple[DrivePatches, PosePrior, Array, SmoothedTrajectory]] = []
+        asked = []
         for patches in self.patches:
             trajectory = trajectories[patches.drive]
             if not isinstance(trajectory, SmoothedTrajectory) or not trajectory.open_kinds:
@@ -142,18 +171,64 @@ class StructureEvidence:
             stamps = np.unique(used.stamps_ns)
             # Errors of later steps are taken for none.
             joint, gain = poses_and_gain(trajectory, stamps, trajectory.open_kinds, end_ns)
-            of_drives.append((used, plain_prior(joint, stamps, heave_m), gain, trajectory))
-        if not of_drives:
+            prior = plain_prior(joint, stamps, heave_m)
+            asked.append(_Asked(used, prior, partial(told_of_errors, gain=gain), trajectory))
+        return self._told(asked, start, held, config)
+
+    def pose_errors(
+        self,
+        trajectories: Sequence[VehicleTrajectory],
+        start: Mapping[str, gtsam.Pose3],
+        config: Config,
+    ) -> tuple[ToldErrors, dict[int, IntArray]]:
+        """What the structure of drives with given poses says of these; and at which stamps.
+
+        `start` are rough T_vehicle_lidar of every LiDAR.
+
+        Raises:
+            SolveError: it could not be solved.
+        """
+        asked, stamps_ns = [], {}
+        for patches in self.patches:
+            trajectory = trajectories[patches.drive]
+            if not isinstance(trajectory, GivenTrajectory) or trajectory.odometry is not None:
+                continue
+            used = scans_for_errors(patches, int(patches.stamps_ns.max(initial=0)))
+            if not len(used.scan):
+                continue
+            stamps = np.unique(used.stamps_ns)
+            chosen = np.arange(0, len(stamps), math.ceil(len(stamps) / MOST_GIVEN))
+            stamps_ns[patches.drive] = stamps[chosen]
+            prior = given_prior(trajectory, stamps, LOOSE, config)
+            asked.append(_Asked(used, prior, partial(told_of_poses, chosen=chosen), trajectory))
+        told = self._told(asked, start, {}, config)
+        return told, {drive: stamps_ns[drive] for drive in told.of_drives}
+
+    def _told(
+        self,
+        asked: Sequence[_Asked],
+        start: Mapping[str, gtsam.Pose3],
+        held: Mapping[str, gtsam.Pose3],
+        config: Config,
+    ) -> ToldErrors:
+        """The answers of the drives that are asked."""
+        if self.errors is None or not asked:
             return NOTHING_TOLD
-        drives, priors, gains, own = zip(*of_drives, strict=True)
-        told, T_vehicle_lidar = self.errors(
-            drives, priors, gains, own, start, held, config, heave_m
+        answers, T_vehicle_lidar = self.errors(
+            [of.patches for of in asked],
+            [of.prior for of in asked],
+            [of.tell for of in asked],
+            [of.trajectory for of in asked],
+            start,
+            held,
+            config,
+            config.noise.heave_m or HEAVE_SIGMA_M,
         )
-        pairs = zip(drives, told, strict=True)
-        by_drive = {patches.drive: of for patches, of in pairs if of is not None}
+        pairs = [(of.patches, told) for of, told in zip(asked, answers, strict=True)]
+        by_drive = {patches.drive: told for patches, told in pairs if told is not None}
         if not by_drive:
             return NOTHING_TOLD
-        solved = [patches for patches in drives if patches.drive in by_drive]
+        solved = [patches for patches, _ in pairs if patches.drive in by_drive]
         return ToldErrors(by_drive, T_vehicle_lidar, place_all(solved, self.patches))
 
     def terms(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,9 @@ from caliv_graph.products import Array
 
 MAX_STEPS = 40
 """Of the optimiser; about fifteen do."""
+
+TIME_STEP = 1e-2
+"""Change of the logarithm of a correlation time by which its derivative is taken."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,75 @@ class Observed:
         taken = scipy.linalg.solve_triangular(LN, A.T @ r, lower=True)
         logarithm = np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum()
         return float(logarithm + 0.5 * (r @ r - taken @ taken))
+
+
+@dataclass(frozen=True)
+class Component:
+    """Errors whose sigma is a product of unknowns, by their numbers."""
+
+    part: Part
+    sigma: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class SlowComponent:
+    """Errors that are correlated over time, in groups that share the time.
+
+    Attributes:
+        parts: correlation time in seconds -> covariance (N, N) of each group at sigma 1.
+        sigmas: numbers of the unknowns, one for each group.
+        time: the same of the correlation time.
+    """
+
+    parts: Callable[[float], Sequence[Array]]
+    sigmas: tuple[int, ...]
+    time: int
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """The restricted likelihood of unknown sigmas, factors and times."""
+
+    observed: Observed
+    components: Sequence[Component]
+    slow: Sequence[SlowComponent] = ()
+
+    def value(self, x: Array) -> float:
+        """Minus the log-likelihood at the logarithms (k,) of the unknowns."""
+        return self.observed.value(*self._errors(x, self._slow_parts(x)))
+
+    def covariance(self, x: Array) -> Array:
+        """(N, N) of all errors there."""
+        return self.observed.covariance(*self._errors(x, self._slow_parts(x)))
+
+    def cost(self, x: Array) -> tuple[float, Array]:
+        """`value`, and its derivative by the logarithms, that of times by a difference."""
+        slow = self._slow_parts(x)
+        parts, logarithms = self._errors(x, slow)
+        value, by_part = self.observed.cost(parts, logarithms)
+        slope = np.zeros(len(x))
+        for numbers, own in zip(self._numbers(), by_part.tolist(), strict=True):
+            slope[list(numbers)] += own
+        for i, of in enumerate(self.slow):
+            later = [*slow[:i], of.parts(math.exp(x[of.time] + TIME_STEP)), *slow[i + 1 :]]
+            changed = self.observed.value(self._errors(x, later)[0], logarithms)
+            slope[of.time] += (changed - value) / TIME_STEP
+        return value, slope
+
+    def _slow_parts(self, x: Array) -> list[Sequence[Array]]:
+        return [of.parts(math.exp(x[of.time])) for of in self.slow]
+
+    def _numbers(self) -> list[tuple[int, ...]]:
+        """Numbers of the unknowns whose product is the sigma of each part."""
+        return [
+            *(of.sigma for of in self.components),
+            *((number,) for of in self.slow for number in of.sigmas),
+        ]
+
+    def _errors(self, x: Array, slow: Sequence[Sequence[Array]]) -> tuple[list[Part], Array]:
+        """All parts and the logarithms of their sigmas."""
+        parts = [*(of.part for of in self.components), *(part for of in slow for part in of)]
+        return parts, np.array([x[list(numbers)].sum() for numbers in self._numbers()])
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,10 @@ class NoiseConfig(Section):
         description="seconds, 1 sigma of the stamps of given poses less the true times, in the "
         "clock of the LiDARs, where they are not synchronised; 0: exact",
     )
-    pose_drift_time_s: Positive = Field(
-        4.0, description="seconds, correlation time of the slowly varying error of given poses"
+    pose_drift_time_s: Positive | None = Field(
+        None,
+        description="seconds, correlation time of the slowly varying error of given poses; absent: "
+        "fitted",
     )
     accelerometer_density_m_s2_sqrthz: Positive | None = None
     gyroscope_density_rad_s_sqrthz: Positive | None = None

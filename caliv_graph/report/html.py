@@ -276,7 +276,7 @@ def _noise_rows(solution: Solution, record: RunRecord) -> list[tuple[str, str]]:
                 "given poses, Gauss-Markov error",
                 f"{1e3 * noise.drift_rotation_rad:.2g} mrad, "
                 f"{1e3 * noise.drift_position_m:.2g} mm per axis, "
-                f"correlation time {noise.drift_time_s:g} s",
+                f"correlation time {noise.drift_time_s:.2g} s",
             ),
         ]
     if solution.registrations:

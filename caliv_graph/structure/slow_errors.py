@@ -7,13 +7,13 @@ do not lie on each other. Motion data alone take most of it for motion.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import gtsam
 import numpy as np
 
 from caliv_graph.config.model import Config
-from caliv_graph.products import Array
+from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.elimination import factor_of, half_solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
@@ -22,6 +22,9 @@ from caliv_graph.structure.solve import Solved, solve_roughly
 from caliv_graph.structure.term import aligned_start, problem_of, usable
 from caliv_graph.structure.thinning import patches_of_scans, some_scans
 from caliv_graph.trajectory.select import VehicleTrajectory
+
+Tell = Callable[[Solved, PosePrior], tuple[Array, Array]]
+"""A solved drive and the prior of its poses -> information and gradient on what is asked."""
 
 ALIGNED_SCANS = 25
 """Scans of a LiDAR whose strips place it for all others too: fewer may be of one place."""
@@ -36,21 +39,20 @@ def scans_for_errors(patches: DrivePatches, until_ns: int) -> DrivePatches:
 def slow_errors(
     patches: Sequence[DrivePatches],
     priors: Sequence[PosePrior],
-    gains: Sequence[Array],
+    tell: Sequence[Tell],
     trajectories: Sequence[VehicleTrajectory],
     start: Mapping[str, gtsam.Pose3],
     held: Mapping[str, gtsam.Pose3],
     config: Config,
     heave_m: float,
 ) -> tuple[tuple[tuple[Array, Array] | None, ...], Mapping[str, gtsam.Pose3]]:
-    """What the structure of each drive says of errors of its sensors, beside its motion data.
+    """What the structure of each drive says of errors of its sensors or poses.
 
     Args:
         patches: of each drive, of the scans that are to be used.
         priors: what the motion data of each drive say of the poses at the stamps of these scans,
             and of nothing else: parameters are eliminated.
-        gains: (6 m, c) of each drive: the poses that its motion data mean are at minus this per
-            unit of an error.
+        tell: of each drive, what is asked (`told_of_errors`, `told_of_poses`).
         trajectories: of each drive.
         start: rough T_vehicle_lidar.
         held: those of LiDARs that a target has placed.
@@ -58,7 +60,7 @@ def slow_errors(
         heave_m: 1 sigma of the heave.
 
     Returns:
-        Per drive information (c, c) and gradient (c,): minus its log-likelihood is
+        Per drive the answer, information (c, c) and gradient (c,): minus its log-likelihood is
         `b^T information b / 2 - gradient^T b`. None: it has no structure. And T_vehicle_lidar at
         which the strips lie on each other.
 
@@ -67,7 +69,7 @@ def slow_errors(
     """
     aligned = aligned_start(patches, trajectories, start, config)
     out = []
-    for own, prior, gain, trajectory in zip(patches, priors, gains, trajectories, strict=True):
+    for own, prior, told, trajectory in zip(patches, priors, tell, trajectories, strict=True):
         used = usable(own, trajectory, aligned, config)
         found = None
         if len(used.scan):
@@ -76,7 +78,7 @@ def slow_errors(
                 followed, prior, trajectory, config, heave_m, held, config.free_offsets()
             )
             found = solve_roughly(problem, aligned)
-        out.append(None if found is None else told_of_errors(found, prior, gain))
+        out.append(None if found is None else told(found, prior))
         if found is not None:
             aligned = {**aligned, **seeing_lidars(found)}
     return tuple(out), aligned
@@ -105,10 +107,30 @@ def seeing_lidars(found: Solved) -> dict[str, gtsam.Pose3]:
     return {patches.lidars[i]: found.state.T_vehicle_lidar[i] for i in seeing}
 
 
-def told_of_errors(found: Solved, prior: PosePrior, gain: Array) -> tuple[Array, Array]:
-    """Information (c, c) and gradient (c,) on errors with a gain (6 m, c), from a solved drive.
+def told_of_poses(found: Solved, prior: PosePrior, chosen: IntArray) -> tuple[Array, Array]:
+    """Information (6 k, 6 k) and gradient (6 k,) on k chosen poses, without their prior.
 
-    `prior` (m poses) is that of the drive, without rates.
+    Right perturbations of the poses of `prior`, which has no parameters. Other poses are eliminated
+    under it, as weak as it is.
+    """
+    H, b = with_hold(found.problem, found.state, found.system)
+    own = (6 * chosen[:, None] + np.arange(6)).ravel()
+    columns = np.zeros((len(H), len(own) + 1))
+    columns[own, np.arange(len(own))] = 1.0
+    columns[:, -1] = b
+    half = half_solved(factor_of(H), columns)
+    together = np.asarray(np.linalg.inv(half[:, :-1].T @ half[:, :-1]), np.float64)
+    mean = found.state.moved[own] + half[:, :-1].T @ half[:, -1]
+    of_prior = np.linalg.inv(np.linalg.inv(prior.information)[np.ix_(own, own)])
+    information = together - of_prior
+    return np.asarray(0.5 * (information + information.T)), np.asarray(together @ mean)
+
+
+def told_of_errors(found: Solved, prior: PosePrior, gain: Array) -> tuple[Array, Array]:
+    """Information (c, c) and gradient (c,) on errors of sensors, from a solved drive.
+
+    `prior` (m poses) is that of the drive, without rates: the poses that its motion data mean are
+    at minus `gain` (6 m, c) per unit of an error.
     """
     H, b = with_hold(found.problem, found.state, found.system)
     moved = found.state.moved[: len(gain)]

@@ -193,6 +193,15 @@ def test_poses_without_errors(seed: int) -> None:
         assert 0.999 * floor <= value <= 1.001 * ceiling
 
 
+@pytest.mark.parametrize("time_s", [1.0, 4.0])
+def test_the_time_of_slow_errors_is_found(time_s: float) -> None:
+    """In the mean of four drives of 10 s: the time of one is hardly known."""
+    found = [fitted(replace(WANDERING, drift_time_s=time_s), seed)[0] for seed in range(4)]
+
+    mean = np.exp(np.mean([np.log(noise.drift_time_s) for noise in found]))
+    assert time_s / 3.0 < mean < 3.0 * time_s
+
+
 def test_what_the_config_gives_is_kept() -> None:
     config = NoiseConfig(pose_position_m=0.0123, pose_drift_rotation_deg=0.5, pose_drift_time_s=7.0)
     found, _ = fitted(BOTH, 0, config=config)

@@ -119,13 +119,12 @@ def test_the_slope_of_all_levels_and_factors_of_clouds_is_right() -> None:
     made, names = evidence(0, 5e-3, None), ["heave", "registration"]
     rng = np.random.default_rng(1)
     x = np.log([4e-3, 1.2, *rng.uniform(0.5, 3.0, 2 * POSES), 6e-3, 3e-3, 8.0])
-    _, slope = sensor_noise._cost(made, names, ["gnss"], x)
+    likelihood = sensor_noise._likelihood(made, names, ["gnss"])
+    _, slope = likelihood.cost(x)
 
     step = 1e-4 * np.eye(len(x))
     for i in (0, 1, 2, 7, len(x) - 3, len(x) - 2):
-        more, less = (
-            sensor_noise._cost(made, names, ["gnss"], x + s * step[i])[0] for s in (1, -1)
-        )
+        more, less = (likelihood.value(x + sign * step[i]) for sign in (1.0, -1.0))
         assert slope[i] == pytest.approx((more - less) / 2e-4, rel=1e-4, abs=1e-4)
 
 

@@ -10,13 +10,14 @@ import pytest
 
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array
-from caliv_graph.structure.problem import Problem, part_of
+from caliv_graph.structure.problem import Problem, part_of, with_hold
 from caliv_graph.structure.slow_errors import (
     of_moved_prior,
     place_all,
     scans_for_errors,
     seeing_lidars,
     told_of_errors,
+    told_of_poses,
 )
 from caliv_graph.structure.thinning import FEW_SCANS
 from tests.structure.test_solve import problem_of, solve
@@ -121,3 +122,26 @@ def test_a_few_scans_of_one_drive_place_no_lidar_of_all() -> None:
     assert not place_all([scans_for_errors(patches, 20 * STEP_NS)], [patches])
     assert not place_all([patches], [patches, late])
     assert place_all([patches, late], [patches, late])
+
+
+def test_what_walls_say_of_poses_is_without_the_prior() -> None:
+    """As many poses as there are: the joint quadratic, extrinsics and all eliminated, less it."""
+    problem = past_walls()
+    found = solve(problem)
+    every = np.arange(POSES)
+    H, b = with_hold(found.problem, found.state, found.system)
+    own, rest = slice(0, 6 * POSES), slice(6 * POSES, len(H))
+    across = np.linalg.solve(H[rest, rest], np.column_stack([H[rest, own], b[rest]]))
+    alone = H[own, own] - H[own, rest] @ across[:, :-1]
+    prior = problem.prior.information
+
+    information, gradient = told_of_poses(found, problem.prior, every)
+
+    size = np.abs(information).max()
+    assert information == pytest.approx(alone - prior, abs=1e-6 * size)
+    moved = found.state.moved[own]
+    expected = alone @ moved + b[own] - H[own, rest] @ across[:, -1]
+    assert gradient == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
+    some, _ = told_of_poses(found, problem.prior, every[::5])
+    values = np.linalg.eigvalsh(some)
+    assert values[0] > -1e-6 * values[-1]

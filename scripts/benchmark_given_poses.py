@@ -1,0 +1,115 @@
+"""S2V and the noise that is found where poses are given whose errors wander.
+
+    .venv/bin/python scripts/benchmark_given_poses.py --scenarios yard --seeds 3
+    .venv/bin/python scripts/benchmark_given_poses.py --scenarios figure_eight --time-s 30
+
+Drives of `configs/scenarios` are simulated in memory and calibrated with the config that `simulate`
+writes, without a word on the noise of the poses. These come at 50 Hz, with white errors of 3 mm and
+0.3 mrad and Gauss-Markov ones of --slow-mm and a twentieth of a milliradian for each of them, over
+--time-s. It prints errors over sigmas and the noise that was found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
+
+import numpy as np
+import scipy.signal
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
+
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import parse_config
+from caliv_graph.errors import CalivError
+from caliv_graph.pipeline import calibrate
+from caliv_graph.products import Array, MotionData
+from caliv_graph.readers.forwarding import ForwardingRecording
+from caliv_graph.scenario.model import load_scenario
+from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
+from caliv_graph.simulation.writer import config_of
+from scripts._given_poses import PERIOD_NS, given_poses, stamps_of
+from scripts._judged import outcome_of, sigmas_off
+
+FOLDER = REPOSITORY / "configs" / "scenarios"
+
+WHITE = np.repeat([3e-4, 3e-3], 3)
+"""White errors: rad, m."""
+
+SLOW_RAD_PER_M = 0.05
+"""Slow errors of rotation for each metre of those of position."""
+
+
+@dataclass(frozen=True)
+class Wandering(ForwardingRecording):
+    """A simulated drive with given poses in the place of raw sensors."""
+
+    slow_m: float
+    time_s: float
+
+    def motion(self) -> MotionData:
+        drive = self.recording
+        assert isinstance(drive, SimulatedRecording)
+        rng = np.random.default_rng([drive.seed, 7])
+        n = len(stamps_of(drive))
+        slow = self.slow_m * np.repeat([SLOW_RAD_PER_M, 1.0], 3)
+        errors = rng.normal(0.0, WHITE, (n, 6)) + slow * wandering(rng, n, self.time_s)
+        return MotionData(super().motion().name, poses=given_poses(drive, errors))
+
+
+def wandering(rng: np.random.Generator, n: int, time_s: float) -> Array:
+    """(n, 6) stationary first-order Gauss-Markov sequences of unit sigma at the period of poses."""
+    decay = np.exp(-1e-9 * PERIOD_NS / time_s)
+    drawn = rng.standard_normal((n, 6)) * np.sqrt(1.0 - decay**2)
+    drawn[0] /= np.sqrt(1.0 - decay**2)
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -decay], drawn, axis=0))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--scenarios", nargs="+", default=["yard"], metavar="NAME")
+    parser.add_argument("--slow-mm", type=float, default=10.0, help="(default: 10)")
+    parser.add_argument("--time-s", type=float, default=10.0, help="(default: 10)")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds 1 to N (default: 3)")
+    asked = parser.parse_args(arguments)
+    for scenario in asked.scenarios:
+        for seed in range(1, asked.seeds + 1):
+            print(text_of(scenario, seed, 1e-3 * asked.slow_mm, asked.time_s), flush=True)
+    return 0
+
+
+def text_of(scenario: str, seed: int, slow_m: float, time_s: float) -> str:
+    """Simulates, calibrates and compares once; what to print."""
+    drive = simulate_drive(load_scenario(FOLDER / f"{scenario}.yaml"), seed)
+    raw = config_of(drive, has_bag=False)
+    raw.pop("noise", None)
+    title = f"{scenario}, seed {seed}, slow errors of {1e3 * slow_m:g} mm over {time_s:g} s"
+    try:
+        config = parse_config(raw, f"{scenario}.yaml", FOLDER)
+        run = calibrate([Wandering(drive, slow_m, time_s)], config, SilentProgress())
+    except CalivError as e:
+        return f"{title}: {e}"
+    outcome = outcome_of(run.calibration, drive.truth.T_vehicle_lidar)
+    noise = run.solution.pose_noise
+    assert noise is not None
+    lines = [
+        f"{title}: exit {outcome['exit']}; found white {1e3 * noise.white_rotation_rad:.2f} mrad, "
+        f"{1e3 * noise.white_position_m:.1f} mm, slow {1e3 * noise.drift_rotation_rad:.2f} mrad, "
+        f"{1e3 * noise.drift_position_m:.1f} mm over {noise.drift_time_s:.0f} s"
+    ]
+    for name, of in outcome["errors"].items():
+        off = " ".join(f"{s:.1f}" for s in sigmas_off(of))
+        nees = "" if of["nees"] is None else f", NEES {of['nees']:.1f} of {of['axes']}"
+        lines.append(f"  {name}: sigmas off {off}{nees}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

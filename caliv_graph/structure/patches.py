@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -49,6 +50,10 @@ class Swept:
             np.concatenate([part.moments for part in known]),
             np.concatenate([part.twist_lidar for part in known]),
         )
+
+
+SMALLEST_SHAPE_M4 = 1e-12
+"""Points within a millimetre of a line across their beams tell no scatter."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +144,25 @@ class DrivePatches:
     def centres_lidar(self) -> Array:
         """(N, 3) centroids, metres, lidar frame as of the patch's own time."""
         return self.moments[:, :3, 3] / self.moments[:, 3, 3, None]
+
+    @cached_property
+    def scatter_along_beam_m(self) -> Array:
+        """(N, 3) direction of the beams; its length: root of the sum of squares of their scatter.
+
+        Metres, lidar frame as of the patch's own time. About the plane that fits the *ranges* best:
+        directions of beams have no noise, so that it does not turn towards them.
+        """
+        centres = self.centres_lidar
+        u = centres / np.linalg.norm(centres, axis=1)[:, None]
+        cov = self.moments[:, :3, :3] / self.points[:, None, None]
+        cov = cov - centres[:, :, None] * centres[:, None, :]
+        across = tangent_axes(u)
+        known = across @ cov @ np.swapaxes(across, 1, 2)
+        shape = known[:, 0, 0] * known[:, 1, 1] - known[:, 0, 1] * known[:, 1, 0]
+        squares = np.linalg.det(cov) / np.maximum(shape, SMALLEST_SHAPE_M4)
+        # Three degrees of freedom went into the plane; all points' noise is in the moments.
+        squares *= self.points**2 / np.maximum(self.points - 3.0, 1.0)
+        return np.asarray(u * np.sqrt(np.maximum(squares, 0.0))[:, None])
 
 
 def along_surface(moments: Array, normals: Array) -> Array:

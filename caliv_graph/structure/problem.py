@@ -127,6 +127,7 @@ class PlacedPatches:
     Attributes:
         moments_at_stamp: (N, 4, 4) in the lidar frame at the stamps of their scans.
         normals_at_stamp: (N, 3) likewise.
+        scatter_at_stamp: (N, 3) `DrivePatches.scatter_along_beam_m`, likewise.
         R_map_lidar: (N, 3, 3) at these stamps.
         t_map_lidar: (N, 3) metres.
         T_vehicle_lidar: of each LiDAR, with which the points were moved to the stamps.
@@ -134,6 +135,7 @@ class PlacedPatches:
 
     moments_at_stamp: Array
     normals_at_stamp: Array
+    scatter_at_stamp: Array
     R_map_lidar: Array
     t_map_lidar: Array
     T_vehicle_lidar: tuple[gtsam.Pose3, ...]
@@ -153,11 +155,11 @@ def placed_patches(problem: Problem, state: State) -> PlacedPatches:
     """The patches of a drive at an estimate."""
     scan = problem.patches.scan
     lidar = problem.patches.scan_lidar[scan]
-    moments, normals = _at_stamp(problem, state, lidar)
+    moments, normals, scatter = _at_stamp(problem, state, lidar)
     R, t = lidar_poses(
         state, lidar, problem.pose_of_scan[scan], problem.twists, problem.accelerations
     )
-    return PlacedPatches(moments, normals, R, t, state.T_vehicle_lidar)
+    return PlacedPatches(moments, normals, scatter, R, t, state.T_vehicle_lidar)
 
 
 def placed_sightings(
@@ -170,6 +172,7 @@ def placed_sightings(
         problem.patches,
         placed.moments_at_stamp,
         normals,
+        placed.scatter_at_stamp,
         strips,
         range_sigma_m,
         placed.T_vehicle_lidar,
@@ -191,17 +194,18 @@ def layout_of(problem: Problem, strips: Strips) -> Layout:
     )
 
 
-def _at_stamp(problem: Problem, state: State, lidar: IntArray) -> tuple[Array, Array]:
-    """Moments and normals of all patches in the lidar frame at their scans' stamps."""
+def _at_stamp(problem: Problem, state: State, lidar: IntArray) -> tuple[Array, Array, Array]:
+    """Moments, normals and scatter of all patches in the lidar frame at their scans' stamps."""
     patches = problem.patches
+    scatter = patches.scatter_along_beam_m
     if not patches.time_s.any():
-        return patches.moments, patches.normal_lidar
+        return patches.moments, patches.normal_lidar, scatter
     T = np.array([T.matrix() for T in state.T_vehicle_lidar])
     inverse = np.array([T.inverse().matrix() for T in state.T_vehicle_lidar])
     moved = inverse[lidar] @ problem.relative @ T[lidar]
     R, t = moved[:, :3, :3], moved[:, :3, 3]
-    normals = np.einsum("nij,nj->ni", R, patches.normal_lidar)
-    return moved_moments(patches.moments, R, t), normals
+    normals, scatter = (np.einsum("nij,nj->ni", R, v) for v in (patches.normal_lidar, scatter))
+    return moved_moments(patches.moments, R, t), normals, scatter
 
 
 def groups_of(sightings: Sightings, strips: Strips) -> IntArray:

@@ -38,8 +38,8 @@ class Sightings:
         moments: (Q, 4, 4) sum of w h h^T, h = (p, 1), p in the lidar frame at the scan's stamp, w
             in 1/m^2.
         noise: (Q, 4, 4) what the noise of the points adds to `moments` in the mean. A plane that
-            is fitted to moments with noise in them turns towards the beams: on ground seen under 70
-            degrees by 0.1 mrad, of each LiDAR to its own side.
+            is fitted to moments with noise in them turns towards the beams: on ground by 0.1 mrad
+            for a LiDAR on a roof, by 20 for one at the bumper, of each to its own side.
         time_s: (Q,) weighted mean of the times of the points, seconds after the scan's stamp.
         T_vehicle_lidar: of each LiDAR, with which points of other times were moved to the stamps.
         beams: what errors of the beams add; None: they have none.
@@ -100,6 +100,7 @@ def sightings_of(
     patches: DrivePatches,
     moments_at_stamp: Array,
     normals_at_stamp: Array,
+    scatter_at_stamp: Array,
     strips: Strips,
     range_sigma_m: Array,
     T_vehicle_lidar: tuple[gtsam.Pose3, ...],
@@ -111,6 +112,7 @@ def sightings_of(
         patches: all patches.
         moments_at_stamp: (N, 4, 4) moments in the lidar frame at the scan's stamp.
         normals_at_stamp: (N, 3) normals of their strips in that frame, of patches on a strip.
+        scatter_at_stamp: (N, 3) scatter of their points along the beams, in that frame.
         strips: which patch is on which.
         range_sigma_m: (L,) noise along the beam of each LiDAR.
         T_vehicle_lidar: of each LiDAR, with which points were moved to the stamp.
@@ -141,7 +143,8 @@ def sightings_of(
         )
     noise = np.zeros_like(moments)
     of_patch = weight * moments_at_stamp[own, 3, 3]
-    noise[:, :3, :3] = np.add.reduceat(of_patch[:, None, None] * _noise(centres, sigma), starts)
+    along = np.sqrt(weight)[:, None] * scatter_at_stamp[own]
+    noise[:, :3, :3] = np.add.reduceat(along[:, :, None] * along[:, None, :], starts)
     return Sightings(
         scan=patches.scan[own[starts]],
         strip=strips.of_patch[own[starts]],
@@ -151,15 +154,6 @@ def sightings_of(
         T_vehicle_lidar=T_vehicle_lidar,
         beams=beams,
     )
-
-
-def _noise(centres_lidar: Array, range_sigma_m: Array) -> Array:
-    """(N, 3, 3) covariance of the noise of a point: along its beam, and across it."""
-    distance = np.linalg.norm(centres_lidar, axis=1)
-    u = centres_lidar / distance[:, None]
-    across = ((BEAM_RAD * distance) ** 2)[:, None, None]
-    along = (range_sigma_m**2)[:, None, None]
-    return np.asarray(across * np.eye(3) + (along - across) * u[:, :, None] * u[:, None, :])
 
 
 def without_own_error(

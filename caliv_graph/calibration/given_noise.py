@@ -13,11 +13,11 @@ import scipy.linalg
 from caliv_graph.calibration.noise import expected_noise, first_pose_noise
 from caliv_graph.calibration.structure_evidence import ToldErrors
 from caliv_graph.calibration.variance_components import Observed
-from caliv_graph.calibration.vehicle_parameters import late_twists, pose_clock_prior
+from caliv_graph.calibration.vehicle_parameters import pose_clock_prior
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, IntArray, PoseNoise
 from caliv_graph.trajectory.noise import given_pose_covariances
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 
 KNOWN_PART = 1e-9
 """Eigenvalues of the information below this part of the largest are those of the gauge."""
@@ -52,7 +52,7 @@ def noise_by_structure(
         root = np.sqrt(values[seen])
         residuals.append(axes[:, seen].T @ gradient / root)
         white = root[:, None] * axes[:, seen].T
-        late.append(white @ late_twists(trajectory, stamps.tolist()).ravel())
+        late.append(white @ twists_at(trajectory, stamps.tolist()).ravel())
         # An error of the position is along the map's axes, a right perturbation along the pose's.
         effect = white.reshape(len(white), -1, 6).copy()
         R, _ = trajectory.poses_at(stamps)
@@ -88,7 +88,7 @@ def noise_by_structure(
     by_message = [of.any(axis=(1, 2)) for of in stated]
     white_parts = of_drives([np.diag(np.where(of, 0.0, 1.0)) for of in by_message])
     every = bool(np.concatenate(by_message).all())
-    noise, _ = expected_noise(
+    return expected_noise(
         observed,
         white_parts,
         slow,
@@ -96,4 +96,3 @@ def noise_by_structure(
         open_levels=(not every, True),
         of_messages=np.concatenate(stated) if every else None,
     )
-    return noise

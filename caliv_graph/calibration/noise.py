@@ -168,7 +168,7 @@ def fit_pose_noise(
     of_messages = None
     if problem.stated_cov is not None and stated.any() and not (given & ~stated).any():
         of_messages = problem.stated_cov[stated]
-    noise, scale = expected_noise(
+    noise = expected_noise(
         observed,
         white,
         slow,
@@ -177,11 +177,13 @@ def fit_pose_noise(
         open_levels=(bool((given & ~stated).any()), bool(given.any())),
         of_messages=of_messages,
     )
+    if not clouds:
+        return noise, TYPICAL_SCALE
     # Solves by all clouds need one scale: a factor for each is for the poses' noise.
     poses = pose_covariance(problem, values, chosen, B, noise)
     alike = Likelihood(replace(observed, known=poses), [Component(cloud, (0,)) for cloud in clouds])
-    of_all, _ = maximise(alike.cost, [SCALE], np.array([scale]))
-    return noise, float(of_all[0])
+    (scale,), _ = maximise(alike.cost, [SCALE], np.array([TYPICAL_SCALE]))
+    return noise, float(scale)
 
 
 def expected_noise(
@@ -193,8 +195,8 @@ def expected_noise(
     clouds: Sequence[Block] = (),
     open_levels: tuple[bool, bool] = (True, True),
     of_messages: Array | None = None,
-) -> tuple[PoseNoise, float]:
-    """The noise of given poses by residuals that it moves; and the scale of the registration's.
+) -> PoseNoise:
+    """The noise of given poses by residuals that it moves.
 
     A drive hardly tells the correlation time. Sigmas are fitted at some times; the result has the
     expected variances, and the same change over short times. Over any time the errors then change
@@ -242,7 +244,7 @@ def expected_noise(
         time_s = float(drift.sum() / (drift.sum(axis=1) / times_s).sum())
     fits = zip(fixed, np.sqrt(expected).tolist(), strict=True)
     a, b, c, d = (fit if value is None else value for value, fit in fits)
-    return PoseNoise(a, b, c, d, time_s), float(found[scale])
+    return PoseNoise(a, b, c, d, time_s)
 
 
 def fit_scale(

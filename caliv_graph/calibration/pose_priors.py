@@ -18,7 +18,6 @@ from caliv_graph.calibration.vehicle_parameters import (
     ParameterPrior,
     ParameterValue,
     chart_of,
-    late_twists,
     motion_gaussian,
     parameter_priors,
     pose_clock_prior,
@@ -30,7 +29,7 @@ from caliv_graph.products import Array, IntArray, PoseNoise
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.trajectory.chain import inverse_of
 from caliv_graph.trajectory.noise import given_pose_covariances
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 
 WALK_RAD, WALK_M = 1e-3, 0.02
@@ -137,7 +136,7 @@ def _given(
     prior, clock = given_prior(trajectory, stamps_ns, noise, config), pose_clock_prior(config)
     if clock is None:
         return prior
-    return _with_clock(prior, late_twists(trajectory, prior.stamps_ns.tolist()), clock)
+    return _with_clock(prior, twists_at(trajectory, prior.stamps_ns.tolist()), clock)
 
 
 def given_prior(

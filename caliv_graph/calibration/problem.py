@@ -18,7 +18,6 @@ from caliv_graph.calibration.vehicle_parameters import (
     MotionTerm,
     ParameterPrior,
     ParameterValue,
-    late_twists,
     motion_term,
     parameter_priors,
     pose_clock_prior,
@@ -422,7 +421,7 @@ def _given_rates(
         own = [i for i, (drive, _) in enumerate(poses) if drive == d]
         stamps = [poses[i][1] for i in own]
         R, _ = trajectory.poses_at(stamps)
-        out[own], any_given = rates_of_errors(R, late_twists(trajectory, stamps)), True
+        out[own], any_given = rates_of_errors(R, twists_at(trajectory, stamps)), True
     return out if any_given else None
 
 

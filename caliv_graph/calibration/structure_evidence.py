@@ -158,6 +158,8 @@ class StructureEvidence:
         Raises:
             SolveError: it could not be solved.
         """
+        if self.errors is None:
+            return NOTHING_TOLD
         heave_m = config.noise.heave_m or HEAVE_SIGMA_M
         asked = []
         for patches in self.patches:
@@ -188,6 +190,8 @@ class StructureEvidence:
         Raises:
             SolveError: it could not be solved.
         """
+        if self.errors is None:
+            return NOTHING_TOLD, {}
         asked, stamps_ns = [], {}
         for patches in self.patches:
             trajectory = trajectories[patches.drive]

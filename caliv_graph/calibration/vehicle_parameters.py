@@ -39,7 +39,7 @@ from caliv_graph.trajectory.parameters import (
     WHEELS_TIME_OFFSET,
     mount_rotation,
 )
-from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
 
@@ -201,17 +201,6 @@ def pose_clock_prior(config: Config) -> ParameterPrior | None:
     if config.solve.time_offset or not sigma.any():
         return None
     return ParameterPrior(np.zeros(1), np.diag(sigma**2), sigma)
-
-
-RATE_WINDOW_NS = 250_000_000
-"""Half the time over which the velocity of given poses is averaged for what their lateness does.
-Noise of the velocity does not go with a slow error of the poses, which takes up most of what the
-lateness does: over 0.1 s it made 10 ms look like 9."""
-
-
-def late_twists(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
-    """(m, 6) how a second of lateness moves given poses, right perturbations."""
-    return twists_at(trajectory, stamps_ns, RATE_WINDOW_NS)
 
 
 def rates_of_errors(R_map_vehicle: Array, twists: Array) -> Array:

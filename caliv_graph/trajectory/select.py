@@ -25,6 +25,12 @@ from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
 TWIST_WINDOW_NS = 50_000_000
 """Half the time over which the vehicle's velocity is averaged: that of a sweep at 10 Hz."""
 
+GIVEN_WINDOW_NS = 250_000_000
+"""The same of given poses, whose noise is in it. A late clock moves poses along the velocity. Noise
+in that does not go with the slow errors of the poses, which take up most of what the clock does:
+over 0.1 s it made 10 ms look like 9, and told 17 ms at 6 sigma where the clocks of a slow robot
+were right."""
+
 
 class VehicleTrajectory(Protocol):
     """The interface of every trajectory, smoothed or given."""
@@ -188,23 +194,19 @@ def accelerations_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) ->
     return np.asarray(change / seconds[:, None])
 
 
-def twists_at(
-    trajectory: VehicleTrajectory, stamps_ns: Sequence[int], half_ns: int = TWIST_WINDOW_NS
-) -> Array:
-    """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second.
-
-    `half_ns`: half the time over which it is averaged.
-    """
-    before, after, seconds = _windows(trajectory, stamps_ns, half_ns)
+def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
+    """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second."""
+    before, after, seconds = _windows(trajectory, stamps_ns)
     first, second = (unstack(*trajectory.poses_at(at)) for at in (before, after))
     steps = zip(first, second, seconds, strict=True)
     return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])
 
 
 def _windows(
-    trajectory: VehicleTrajectory, stamps_ns: Sequence[int], half_ns: int = TWIST_WINDOW_NS
+    trajectory: VehicleTrajectory, stamps_ns: Sequence[int]
 ) -> tuple[IntArray, IntArray, Array]:
     """(m,) begin and end of the time around each stamp that is averaged over, and its seconds."""
+    half_ns = GIVEN_WINDOW_NS if isinstance(trajectory, GivenTrajectory) else TWIST_WINDOW_NS
     begin, end = trajectory.span_ns
     stamps = np.asarray(stamps_ns, dtype=np.int64)
     before = np.maximum(stamps - half_ns, begin)

@@ -33,8 +33,8 @@ def test_all_lidars_late_alike_are_found_from_a_linear_change_far_off() -> None:
     found, *others = solved
     sigma_s = float(np.sqrt(found.freed.cov[0, 0]))
     assert found.freed.change[0] == pytest.approx(LATE_S, abs=3.0 * sigma_s)
-    # What the clock of given poses may be off by; the clouds tell the sum to a millisecond.
-    assert sigma_s == pytest.approx(config.noise.pose_time_offset_s, rel=0.05)
+    # At most what the clock of given poses may be off by; the clouds tell the sum to a millisecond.
+    assert sigma_s < 1.05 * config.noise.pose_time_offset_s
     # Nothing else is wrong: what else the blurred shape contradicts ends with the lateness.
     assert found.explains > 0.9
     assert max(each.sigmas_left for each in others) < 3.0

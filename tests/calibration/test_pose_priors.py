@@ -12,11 +12,11 @@ from caliv_graph.calibration.graph import initial_values, pose_graph
 from caliv_graph.calibration.linear import dense_system
 from caliv_graph.calibration.pose_priors import pose_priors
 from caliv_graph.calibration.problem import pose_problem
-from caliv_graph.calibration.vehicle_parameters import POSE_TIME_OFFSET, late_twists
+from caliv_graph.calibration.vehicle_parameters import POSE_TIME_OFFSET
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, PoseNoise, Trajectory
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
 from tests.calibration.problems import eight
 from tests.calibration.test_vehicle_parameters import CONFIG, WANTED, drive
 
@@ -76,7 +76,7 @@ def test_given_poses_that_are_late_are_moved_along_the_drive() -> None:
     exact = pose_priors([trajectory], {0: STAMPS}, 0.005, NOISE, EXACT)[0]
     assert not exact.parameters
     late_s = 0.013
-    moves = late_s * late_twists(trajectory, STAMPS.tolist()).ravel()
+    moves = late_s * twists_at(trajectory, STAMPS.tolist()).ravel()
 
     # Poses that are ahead of the given ones by 13 ms have no residuals if these are as late.
     d = np.append(moves, late_s)

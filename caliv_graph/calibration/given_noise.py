@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import scipy.linalg
 
-from caliv_graph.calibration.noise import expected_noise, first_pose_noise
+from caliv_graph.calibration.noise import KNOWN_PART, expected_noise, first_pose_noise
 from caliv_graph.calibration.structure_evidence import ToldErrors
 from caliv_graph.calibration.variance_components import Observed
 from caliv_graph.calibration.vehicle_parameters import pose_clock_prior
@@ -18,9 +18,6 @@ from caliv_graph.config.model import Config
 from caliv_graph.products import Array, IntArray, PoseNoise
 from caliv_graph.trajectory.noise import given_pose_covariances
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
-
-KNOWN_PART = 1e-9
-"""Eigenvalues of the information below this part of the largest are those of the gauge."""
 
 
 def noise_by_structure(

@@ -1,0 +1,115 @@
+"""Calibrations of drives that another simulator than the project's wrote, against the truth.
+
+    .venv/bin/python scripts/benchmark_foreign.py --scenarios eight robot --seeds 1
+    .venv/bin/python scripts/benchmark_foreign.py --scenarios slalom --off edges,channel_angle
+
+The simulator (`_foreign_*.py`) imports nothing from caliv_graph. It writes a bag, a config as a
+user would, with errors of lever arms and guesses, and the truth; the bag is calibrated as
+`caliv-graph calibrate` does. Errors are in vehicle axes, of the axes that the drive determines,
+with their sigmas. Bags stay in the folder (0.2 to 2 GB each) only with --keep.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
+
+from caliv_graph._open3d import import_open3d
+from caliv_graph.batch.job import open_recordings, run_job
+from caliv_graph.common.exits import USAGE
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.load import load_config
+from caliv_graph.conventions import AXES
+from caliv_graph.errors import CalivError
+from caliv_graph.results.truth_file import read_truth
+from scripts._command import exit_code_of, positive
+from scripts._foreign_draws import EFFECTS, Draws
+from scripts._foreign_drives import SCENARIOS, simulate
+from scripts._judged import outcome_of, sigmas_off
+
+OUT = REPOSITORY / "out" / "foreign"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    effects = "\n".join(f"  {name:20}{text}" for name, text in EFFECTS.items())
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").splitlines()[0],
+        epilog=f"effects:\n{effects}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS), metavar="NAME"
+    )
+    parser.add_argument("--seeds", type=positive, default=1, help="seeds 1 to N (default: 1)")
+    parser.add_argument("--off", type=effects_of, default=frozenset(), metavar="EFFECT,...")
+    parser.add_argument("--keep", action="store_true", help="keep the bags")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder (default: out/foreign)")
+    asked = parser.parse_args(arguments)
+    import_open3d()  # with its shared libraries, for the simulator as well
+    for name in asked.scenarios:
+        for seed in range(1, asked.seeds + 1):
+            draws = Draws(name, seed, asked.off)
+            print(text_of(draws, asked.out / f"{name}_{seed}", asked.keep), flush=True)
+    return 0
+
+
+def effects_of(text: str) -> frozenset[str]:
+    """Effects that are named with commas between them."""
+    names = frozenset(text.split(","))
+    unknown = sorted(names - EFFECTS.keys())
+    if unknown:
+        raise argparse.ArgumentTypeError(f"no such effect: {', '.join(unknown)}; see --help")
+    return names
+
+
+def text_of(draws: Draws, folder: Path, keep: bool) -> str:
+    """Simulates, calibrates and compares once; what to print."""
+    if folder.exists():
+        shutil.rmtree(folder)
+    simulate(SCENARIOS[draws.scenario], draws, folder)
+    title = f"{draws.scenario}, seed {draws.seed}"
+    if draws.off:
+        title += f", without {', '.join(sorted(draws.off))}"
+    begun = time.monotonic()
+    try:
+        config = load_config(folder / "config.yaml")
+        job = run_job(open_recordings(config, ()), config, SilentProgress())
+    except CalivError as e:
+        return f"{title}: exit {USAGE}: {e}"
+    wall_s = time.monotonic() - begun
+    outcome = outcome_of(job.calibration, read_truth(folder / "truth.yaml"))
+    if not keep:
+        shutil.rmtree(folder / "drive")
+    return "\n".join([f"{title}: exit {outcome['exit']}, {wall_s:.0f} s", *rows_of(outcome)])
+
+
+def rows_of(outcome: Mapping[str, Any]) -> Iterator[str]:
+    """A line per S2V and S2S, then what the calibration says of itself."""
+    for name, of in outcome["errors"].items():
+        cells = [
+            f"{axis} {1e3 * error:.2f} ± {1e3 * sigma:.2f}"
+            for axis, error, sigma in zip(AXES, of["error"], of["sigma"], strict=True)
+            if error is not None
+        ]
+        worst = max(sigmas_off(of), default=0.0)
+        nees = "" if of["nees"] is None else f"; NEES {of['nees']:.1f} of {of['axes']}"
+        yield f"  {name} (mrad, mm): {', '.join(cells)}{nees}, worst {worst:.1f} sigmas"
+    for text in outcome["undetermined"]:
+        yield f"  not determined: {text}"
+    for text in outcome["said"]:
+        yield f"  {text}"
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code_of(main))

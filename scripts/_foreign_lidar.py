@@ -161,6 +161,17 @@ def _solid(lidar: Lidar) -> Beams:
     return Beams(azimuth, elevation, 0.95 * lidar.period_s * done, row)
 
 
+@dataclass(frozen=True)
+class Rays:
+    """Rays (n, 3) in the world and in the axle frame, and their times."""
+
+    origin: Array
+    direction: Array
+    time_s: Array
+    body_origin: Array
+    body_direction: Array
+
+
 class Scene:
     """Meshes that stand, meshes that move, and the vehicle's own body.
 
@@ -213,17 +224,6 @@ def _cast(
     hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
     cosine = np.abs(np.sum(hit["primitive_normals"].numpy() * direction, axis=1))
     return hit["t_hit"].numpy().astype(np.float64), cosine
-
-
-@dataclass(frozen=True)
-class Rays:
-    """Rays (n, 3) in the world and in the axle frame, and their times."""
-
-    origin: Array
-    direction: Array
-    time_s: Array
-    body_origin: Array
-    body_direction: Array
 
 
 class _Moving:

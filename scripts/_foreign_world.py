@@ -25,7 +25,6 @@ CELL_M = 0.25
 MARGIN_M = 45.0
 """Of the ground around a path."""
 
-
 STOREY_M = 2.8
 PLASTER_CELL_M = 0.7
 

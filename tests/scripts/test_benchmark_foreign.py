@@ -126,7 +126,6 @@ def test_the_same_seed_gives_the_same_drive_which_the_program_reads(tmp_path: Pa
     draws = {
         "one": Draws("short", 1),
         "again": Draws("short", 1),
-        "renamed": Draws("other", 1),
         "exact_arms": Draws("short", 1, frozenset({"lever_arm"})),
     }
     for name, of in draws.items():
@@ -135,15 +134,21 @@ def test_the_same_seed_gives_the_same_drive_which_the_program_reads(tmp_path: Pa
     one = list(messages(tmp_path / "one"))
     assert one == list(messages(tmp_path / "again"))
     assert one == list(messages(tmp_path / "exact_arms"))
-    assert one != list(messages(tmp_path / "renamed"))
     configs = {name: load_config(tmp_path / name / "config.yaml") for name in draws}
     assert configs["one"].lidars == configs["exact_arms"].lidars
     assert configs["one"].gnss != configs["exact_arms"].gnss
-    assert configs["one"].gnss != configs["renamed"].gnss
     truth = read_truth(tmp_path / "one" / "truth.yaml")
     assert truth.keys() == short.lidars.keys()
     recording = open_recording(configs["one"], None)
     assert all(len(recording.scan_stamps_ns(name)) > 3 for name in truth)
+
+
+def test_every_scenario_seed_and_name_has_a_stream_of_its_own() -> None:
+    draws = [Draws("eight", 1), Draws("eight", 2), Draws("slalom", 1)]
+    first = {of.stream(name).random() for of in draws for name in ("imu arm", "gnss arm")}
+
+    assert len(first) == 6
+    assert Draws("eight", 1).stream("imu arm").random() in first
 
 
 def test_unknown_effects_are_refused() -> None:

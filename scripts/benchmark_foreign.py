@@ -6,7 +6,7 @@
 The simulator (`_foreign_*.py`) imports nothing from caliv_graph. It writes a bag, a config as a
 user would, with errors of lever arms and guesses, and the truth; the bag is calibrated as
 `caliv-graph calibrate` does. Errors are in vehicle axes, of the axes that the drive determines,
-with their sigmas. Bags stay in the folder (0.2 to 2 GB each) only with --keep.
+with their sigmas. Bags stay in the folder (about half a GB for two LiDARs) only with --keep.
 """
 
 from __future__ import annotations

@@ -275,7 +275,7 @@ def scan(draws: Draws, name: str, lidar: Lidar, motion: Motion, scene: Scene) ->
         moving = _Moving(lidar, motion, start_s, sent.time_s)
         ranges, cosines = scene.cast(moving.rays(real))
         if draws.on("edges"):
-            ranges = _at_edges(at_edges, lidar, scene, moving, real, ranges)
+            ranges = _at_edges(at_edges, lidar, scene, moving, real, ranges, cosines)
         cosines = np.maximum(cosines, 0.03)
         seen = np.isfinite(ranges) & (ranges > NEAREST_M) & (ranges < lidar.max_range_m)
         far = np.where(seen, ranges, 1.0)
@@ -300,14 +300,19 @@ def _at_edges(
     moving: _Moving,
     directions: Array,
     ranges: Array,
+    cosines: Array,
 ) -> Array:
-    """Ranges of beams with a width, part of which hits another surface: between both, or none."""
+    """Ranges of beams with a width, part of which hits another surface: between both, or none.
+
+    `cosines` are those of the incidence: on a slanting surface the footprint is no edge.
+    """
     aside = directions + rng.normal(size=directions.shape) * lidar.divergence_rad
     aside /= np.linalg.norm(aside, axis=1)[:, None]
     others, _ = scene.cast(moving.rays(aside))
     both = np.isfinite(ranges) & np.isfinite(others)
     gap = np.abs(np.where(both, others, 0) - np.where(both, ranges, 0))
-    edge = both & (gap > 0.04)
+    slant = lidar.divergence_rad * np.where(both, ranges, 0) / np.maximum(np.abs(cosines), 0.03)
+    edge = both & (gap > 0.04 + 4.0 * slant)
     mixed = edge & (gap < 1.2) & (rng.random(len(ranges)) < 0.6)
     share = rng.random(len(ranges))
     out = ranges.copy()

@@ -182,7 +182,7 @@ def fit_pose_noise(
     # Solves by all clouds need one scale: a factor for each is for the poses' noise.
     poses = pose_covariance(problem, values, chosen, B, noise)
     alike = Likelihood(replace(observed, known=poses), [Component(cloud, (0,)) for cloud in clouds])
-    (scale,), _ = maximise(alike.cost, [SCALE], np.array([TYPICAL_SCALE]))
+    (scale,), _ = maximise(alike.cost, [SCALE], np.array([TYPICAL_SCALE]), exactly=True)
     return noise, float(scale)
 
 
@@ -230,7 +230,7 @@ def expected_noise(
     for row, time in enumerate(times_s.tolist()):
         parts = [Component(part, (number,)) for number, part in enumerate((*white, *slow(time)))]
         likelihood = Likelihood(observed, [*parts, *of_clouds])
-        found, cost = maximise(likelihood.cost, unknowns, found)
+        found, cost = maximise(likelihood.cost, unknowns, found, exactly=True)
         surprise = math.log(time / TYPICAL.drift_time_s) / TIME_SPREAD
         costs[row], variances[row] = cost + 0.5 * surprise**2, found[:scale] ** 2
     weight = np.exp(costs.min() - costs)

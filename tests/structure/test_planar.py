@@ -50,6 +50,22 @@ def centres(patches: ScanPatches) -> Array:
     return np.asarray(patches.moments[:, :3, 3] / patches.moments[:, 3, 3, None])
 
 
+def of_one_scan(patches: ScanPatches, *moved_with: gtsam.Pose3) -> DrivePatches:
+    return DrivePatches(
+        drive=0,
+        lidars=("front",),
+        stamps_ns=np.zeros(1, np.int64),
+        scan_lidar=np.zeros(1, np.int64),
+        scan=np.zeros(len(patches.time_s), np.int64),
+        time_s=patches.time_s,
+        moments=patches.moments,
+        normal_lidar=patches.normal_lidar,
+        scatter_m=patches.scatter_m,
+        swept=patches.swept,
+        moved_with=moved_with,
+    )
+
+
 def test_the_moments_are_the_sums_over_the_points() -> None:
     # All within one cell of 3.75 degrees.
     rays = beams(np.arange(0.2, 3.4, 0.25), np.arange(0.2, 3.4, 0.25))
@@ -251,19 +267,7 @@ def test_patches_of_a_sweep_follow_better_extrinsics() -> None:
         twist = T_vehicle_lidar.inverse().AdjointMap() @ of_vehicle
         motion = SweepMotion(0.0, np.tile(twist[:3], (11, 1)), np.tile(twist[3:], (11, 1)))
         found = planar_patches(points, SIGMA_M, times, motion)
-        return DrivePatches(
-            drive=0,
-            lidars=("front",),
-            stamps_ns=np.zeros(1, np.int64),
-            scan_lidar=np.zeros(1, np.int64),
-            scan=np.zeros(len(found.time_s), np.int64),
-            time_s=found.time_s,
-            moments=found.moments,
-            normal_lidar=found.normal_lidar,
-            scatter_m=found.scatter_m,
-            swept=found.swept,
-            moved_with=(T_vehicle_lidar,),
-        )
+        return of_one_scan(found, T_vehicle_lidar)
 
     def tilts(patches: DrivePatches) -> Array:
         """Slope of each patch to the left of its beams, rad."""
@@ -306,17 +310,7 @@ def test_noise_along_the_beams_is_taken_out_of_the_tilt_of_ground() -> None:
     rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), -np.sin(down)], axis=1)
     ranges = height_m / np.sin(down) + rng.normal(0.0, sigma_m, len(down))
     found = planar_patches(rays * ranges[:, None], 0.01)
-    of = DrivePatches(
-        drive=0,
-        lidars=("livox",),
-        stamps_ns=np.zeros(1, np.int64),
-        scan_lidar=np.zeros(1, np.int64),
-        scan=np.zeros(len(found.time_s), np.int64),
-        time_s=found.time_s,
-        moments=found.moments,
-        normal_lidar=found.normal_lidar,
-        scatter_m=found.scatter_m,
-    )
+    of = of_one_scan(found)
     along = of.scatter_along_beam_m
 
     squares = (along**2).sum()

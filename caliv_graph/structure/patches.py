@@ -153,7 +153,7 @@ class DrivePatches:
         directions of beams have no noise, so that it does not turn towards them.
         """
         centres = self.centres_lidar
-        u = centres / np.linalg.norm(centres, axis=1)[:, None]
+        u = centres / np.maximum(np.linalg.norm(centres, axis=1), 1e-9)[:, None]
         cov = self.moments[:, :3, :3] / self.points[:, None, None]
         cov = cov - centres[:, :, None] * centres[:, None, :]
         across = tangent_axes(u)

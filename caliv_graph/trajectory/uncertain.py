@@ -61,6 +61,9 @@ LATE_SIGMAS = 4.0
 """Of what the motion data alone say of that clock, from which it is late: one sound drive in 16,000
 is that far off."""
 
+MOST_LATE_SIGMAS = 5.0
+"""Largest lateness of the fixes, in sigmas of their clock, at which that is freed."""
+
 WIDE_SIGMAS = {
     LEVER_ARM.name: 0.05,
     IMU_ROTATION.name: np.radians(1.0),
@@ -220,6 +223,11 @@ def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
             # The offset is what the data alone say, times their part of all information.
             pull = (p.offset[0] + settled.step[at]) / variance
             if not pull**2 > LATE_SIGMAS**2 * told > 0.0:
+                return None
+            # So late is no clock that is merely not synchronised: an antenna a metre from where it
+            # was typed to be swings in curves like one. The ranking of suspects tells which it is.
+            assert p.beside_lidars is not None
+            if abs(pull) > MOST_LATE_SIGMAS * p.beside_lidars[0] * told:
                 return None
             out[i] = replace(p, sigmas=p.beside_lidars)
             return tuple(out)

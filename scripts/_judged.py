@@ -55,6 +55,11 @@ def sigmas_off(of: Mapping[str, Any]) -> list[float]:
     return [abs(error) / sigma for error, sigma in pairs if error is not None]
 
 
+def nees_text(of: Mapping[str, Any]) -> str:
+    """The NEES of a quantity and its number of axes, after a comma; empty if there is none."""
+    return "" if of["nees"] is None else f", NEES {of['nees']:.1f} of {of['axes']}"
+
+
 def _judged(
     of: Mapping[str, Any],
     lidar: str,

@@ -36,7 +36,7 @@ from caliv_graph.results.truth_file import read_truth
 from scripts._command import exit_code_of, positive
 from scripts._foreign_draws import EFFECTS, Draws
 from scripts._foreign_drives import SCENARIOS, simulate
-from scripts._judged import outcome_of, sigmas_off
+from scripts._judged import nees_text, outcome_of, worst
 
 OUT = REPOSITORY / "out" / "foreign"
 
@@ -102,9 +102,8 @@ def rows_of(outcome: Mapping[str, Any]) -> Iterator[str]:
             for axis, error, sigma in zip(AXES, of["error"], of["sigma"], strict=True)
             if error is not None
         ]
-        worst = max(sigmas_off(of), default=0.0)
-        nees = "" if of["nees"] is None else f"; NEES {of['nees']:.1f} of {of['axes']}"
-        yield f"  {name} (mrad, mm): {', '.join(cells)}{nees}, worst {worst:.1f} sigmas"
+        far = f", worst {worst({name: of}):.1f} sigmas"
+        yield f"  {name} (mrad, mm): {', '.join(cells)}{nees_text(of)}{far}"
     for text in outcome["undetermined"]:
         yield f"  not determined: {text}"
     for text in outcome["said"]:

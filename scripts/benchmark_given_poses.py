@@ -21,7 +21,6 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
 
 import numpy as np
-import scipy.signal
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # imports the modules beside this script from any folder
@@ -30,13 +29,14 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
 from caliv_graph.errors import CalivError
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import Array, MotionData
+from caliv_graph.products import MotionData
 from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.scenario.model import load_scenario
+from caliv_graph.simulation.noise import gauss_markov
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
-from scripts._given_poses import PERIOD_NS, given_poses, stamps_of
-from scripts._judged import outcome_of, sigmas_off
+from scripts._given_poses import given_poses, stamps_of
+from scripts._judged import nees_text, outcome_of, sigmas_off
 
 FOLDER = REPOSITORY / "configs" / "scenarios"
 
@@ -58,18 +58,11 @@ class Wandering(ForwardingRecording):
         drive = self.recording
         assert isinstance(drive, SimulatedRecording)
         rng = np.random.default_rng([drive.seed, 7])
-        n = len(stamps_of(drive))
+        stamps = stamps_of(drive)
+        errors = rng.normal(0.0, WHITE, (len(stamps), 6))
         slow = self.slow_m * np.repeat([SLOW_RAD_PER_M, 1.0], 3)
-        errors = rng.normal(0.0, WHITE, (n, 6)) + slow * wandering(rng, n, self.time_s)
+        errors += slow * gauss_markov(stamps, self.time_s, rng, 6)
         return MotionData(super().motion().name, poses=given_poses(drive, errors))
-
-
-def wandering(rng: np.random.Generator, n: int, time_s: float) -> Array:
-    """(n, 6) stationary first-order Gauss-Markov sequences of unit sigma at the period of poses."""
-    decay = np.exp(-1e-9 * PERIOD_NS / time_s)
-    drawn = rng.standard_normal((n, 6)) * np.sqrt(1.0 - decay**2)
-    drawn[0] /= np.sqrt(1.0 - decay**2)
-    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -decay], drawn, axis=0))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -106,8 +99,7 @@ def text_of(scenario: str, seed: int, slow_m: float, time_s: float) -> str:
     ]
     for name, of in outcome["errors"].items():
         off = " ".join(f"{s:.1f}" for s in sigmas_off(of))
-        nees = "" if of["nees"] is None else f", NEES {of['nees']:.1f} of {of['axes']}"
-        lines.append(f"  {name}: sigmas off {off}{nees}")
+        lines.append(f"  {name}: sigmas off {off}{nees_text(of)}")
     return "\n".join(lines)
 
 

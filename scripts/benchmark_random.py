@@ -43,7 +43,7 @@ from caliv_graph.scenario.model import dump_scenario
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
 from scripts._guesses import drop_guesses
-from scripts._judged import outcome_of, sigmas_off, worst
+from scripts._judged import nees_text, outcome_of, sigmas_off, worst
 from scripts._random_drives import RandomDrive, random_drive, with_options
 from scripts._runs import add_line, code_digest, json_lines, performed
 
@@ -181,9 +181,9 @@ def text_of(line: Mapping[str, Any]) -> str:
         shown = ["-" if e is None else f"{1e3 * e:.2f}" for e in of["error"]]
         off = iter(sigmas_off(of))
         sigmas = " ".join("-" if e is None else f"{next(off):.1f}" for e in of["error"])
-        nees = "" if of["nees"] is None else f", NEES {of['nees']:.1f} of {of['axes']}"
         out.append(
-            f"  {name}: {' '.join(shown[:3])} mrad, {' '.join(shown[3:])} mm; sigmas {sigmas}{nees}"
+            f"  {name}: {' '.join(shown[:3])} mrad, {' '.join(shown[3:])} mm; "
+            f"sigmas {sigmas}{nees_text(of)}"
         )
     out += [f"  not determined: {text}" for text in line["undetermined"]]
     out += [f"  {text}" for text in line["said"]]

@@ -35,6 +35,7 @@ from caliv_graph.calibration.variance_components import (
     Observed,
     Unknown,
     maximise,
+    time_of_expected,
 )
 from caliv_graph.calibration.vehicle_parameters import KEYS, POSE_TIME_OFFSET
 from caliv_graph.config.noise import NoiseConfig
@@ -180,7 +181,8 @@ def fit_pose_noise(
     if not clouds:
         return noise, TYPICAL_SCALE
     # Solves by all clouds need one scale: a factor for each is for the poses' noise.
-    poses = pose_covariance(problem, values, chosen, B, noise)
+    sigmas = np.array(astuple(noise)[:4])
+    poses = observed.covariance((*white, *slow(noise.drift_time_s)), np.log(sigmas))
     alike = Likelihood(replace(observed, known=poses), [Component(cloud, (0,)) for cloud in clouds])
     (scale,), _ = maximise(alike.cost, [SCALE], np.array([TYPICAL_SCALE]), exactly=True)
     return noise, float(scale)
@@ -241,7 +243,7 @@ def expected_noise(
         expected[:2] = of_each[:, :3].mean(), of_each[:, 3:].mean()
     if not given_time:
         drift = weight[:, None] * variances[:, 2:] / np.square(astuple(TYPICAL)[2:4])
-        time_s = float(drift.sum() / (drift.sum(axis=1) / times_s).sum())
+        time_s = time_of_expected(drift.T, times_s)
     fits = zip(fixed, np.sqrt(expected).tolist(), strict=True)
     a, b, c, d = (fit if value is None else value for value, fit in fits)
     return PoseNoise(a, b, c, d, time_s)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caliv_graph.calibration.evidence import Evidence
+from caliv_graph.calibration.variance_components import time_of_expected
 from caliv_graph.products import Array
 from caliv_graph.trajectory.correlated import AXES, GROUPS, CorrelatedError
 
@@ -151,8 +152,7 @@ def _summary(kind: str, groups: Sequence[Array], sizes: Array, gain: Array) -> O
     weight /= weight.sum()
     variance = np.array([(weight * every[at][..., None] ** 2).sum((*range(n),)) for at in chosen])
     variance = np.maximum(variance, LEAST**2 / len(TIMES_S))
-    # Variance and slope at zero of the expected covariance.
-    time_s = float(variance.sum() / (variance / TIMES_S).sum())
+    time_s = time_of_expected(variance, TIMES_S)
     sigmas = np.sqrt(variance.sum(axis=1)) @ np.array(groups)
     return OpenError(float(weight[(0,) * n].sum()), _error(kind, sigmas, time_s))
 

@@ -216,7 +216,8 @@ class StructureEvidence:
         config: Config,
     ) -> ToldErrors:
         """The answers of the drives that are asked."""
-        if self.errors is None or not asked:
+        assert self.errors is not None
+        if not asked:
             return NOTHING_TOLD
         answers, T_vehicle_lidar = self.errors(
             [of.patches for of in asked],

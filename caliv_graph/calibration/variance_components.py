@@ -185,6 +185,15 @@ class Unknown:
     bounds: tuple[float, float]
 
 
+def time_of_expected(variances: Array, times_s: Array) -> float:
+    """Time of one Gauss-Markov error of expected size, seconds.
+
+    It changes over short times as the hypotheses do together, and over longer ones by no less
+    (Jensen). `variances` (..., n) are the expected ones by each of their times (n,).
+    """
+    return float(variances.sum() / (variances / times_s).sum())
+
+
 def maximise(
     cost: Callable[[Array], tuple[float, Array]],
     unknowns: Sequence[Unknown],

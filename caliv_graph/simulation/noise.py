@@ -85,9 +85,11 @@ def drawn_channel_errors(model: LidarModel, rng: np.random.Generator) -> Channel
     )
 
 
-def gauss_markov(stamps_ns: IntArray, correlation_s: float, rng: np.random.Generator) -> Array:
-    """(n, 3) first-order Gauss-Markov errors of unit sigma, stationary from the first stamp on."""
-    draws = rng.standard_normal((len(stamps_ns), 3))
+def gauss_markov(
+    stamps_ns: IntArray, correlation_s: float, rng: np.random.Generator, axes: int = 3
+) -> Array:
+    """(n, axes) first-order Gauss-Markov errors of unit sigma, stationary from the first stamp."""
+    draws = rng.standard_normal((len(stamps_ns), axes))
     dt_s = np.diff(stamps_ns) / NANOSECONDS_PER_SECOND
     decay = np.exp(-dt_s / correlation_s)
     fresh = np.sqrt(1.0 - decay**2)

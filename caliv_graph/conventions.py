@@ -74,6 +74,11 @@ def key_lever_arm() -> int:
     return int(gtsam.symbol("l", 0))
 
 
+def key_imu_place() -> int:
+    """Key of the IMU in the vehicle frame, (3,) metres, one for all drives."""
+    return int(gtsam.symbol("l", 1))
+
+
 def key_imu_rotation() -> int:
     """Key of R_vehicle_imu, a `gtsam.Rot3`, right perturbation, one for all drives."""
     return int(gtsam.symbol("r", 0))
@@ -123,9 +128,10 @@ def key_ground_bias(index: int) -> int:
 
 
 def key_rates(drive: int) -> int:
-    """Key of the errors of a drive's mean rates, (6,): angular velocity (rad/s), velocity (m/s).
+    """Key of the errors of a drive's rates, (9,): angular velocity (rad/s), velocity (m/s), m.
 
-    Along vehicle axes, true ones less those of the trajectory; the velocity is that in the map.
+    Along vehicle axes, true ones less those of the trajectory; the velocity is that in the map. The
+    last three are how far the vehicle's origin is from the point that the velocity is of.
     """
     return int(gtsam.symbol("t", drive))
 

@@ -15,11 +15,13 @@ import numpy as np
 from caliv_graph.geometry.se3 import (
     left_jacobian_inverse,
     right_to_vehicle_axes,
+    skew,
     turned_twist,
     twist_by_turn,
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array
+from caliv_graph.trajectory.rates import by_rates
 
 
 def chain_jacobians(chain: Sequence[gtsam.Pose3]) -> tuple[gtsam.Pose3, list[Array]]:
@@ -77,9 +79,12 @@ class CloudMotion:
             out.append((gtsam.Pose3.Expmap(-offset_s * mean), -by_motion @ then[:, None], by_turn))
         if self.apart_s:
             then = self.twist_from(pose, -offset_s)
-            d = self.apart_s * (then + values.atVector(left.pop(0)))
-            by_rates = self.apart_s * np.asarray(gtsam.Pose3.ExpmapDerivative(d))
-            out.append((gtsam.Pose3.Expmap(d), by_rates, by_rates @ twist_by_turn(then)))
+            wrong, by_errors = values.atVector(left.pop(0)), by_rates(then[:3])
+            d = self.apart_s * (then + by_errors @ wrong)
+            by_twist = self.apart_s * np.asarray(gtsam.Pose3.ExpmapDerivative(d))
+            by_turn = twist_by_turn(then)
+            by_turn[3:] -= skew(wrong[6:]) @ skew(then[:3])
+            out.append((gtsam.Pose3.Expmap(d), by_twist @ by_errors, by_twist @ by_turn))
         return out
 
     def twist_from(self, pose: gtsam.Pose3, after_s: float = 0.0) -> Array:
@@ -106,8 +111,8 @@ def predict_cloud(
 ) -> tuple[gtsam.Pose3, list[Array]]:
     """The pose that a cloud should have, and how it moves.
 
-    It is `C X_i Exp(-o (xi - o a / 2)) Exp(tau (xi - o a + e)) E S_a U`, xi and a velocity and
-    acceleration at the stamp, U (`undone`) what the present rates and extrinsic do to points that
+    It is `C X_i Exp(-o (xi - o a / 2)) Exp(tau (xi - o a + W e)) E S_a U`, xi and a velocity and
+    acceleration at the stamp, W `by_rates`, U (`undone`) what rates and extrinsic do to points that
     were not moved.
 
     Args:
@@ -131,7 +136,9 @@ def predict_cloud(
         Z = Z.compose(motion.undone())
         if motion.offset:
             acceleration = motion.in_axes_of(X, motion.acceleration)
-            moves[2] = moves[2] - moves[3] @ acceleration[:, None]
+            # The shift of the origin turns with the rates, too.
+            acceleration[3:] += np.cross(acceleration[:3], values.atVector(others[1])[6:])
+            moves[2] = moves[2] - moves[3][:, :6] @ acceleration[:, None]
     return Z, moves
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.geometry.se3 import skew, turned_twist, twist_by_turn
 from caliv_graph.products import Array, GroundObservation
+from caliv_graph.trajectory.rates import by_rates
 
 SWAY_SIGMA_RAD = 1e-3
 """Sway: tilt of the body on its springs at each stamp from its mean over the drive, per axis, where
@@ -142,12 +143,12 @@ def ground_plane_factor(
     """
     poses = list(pose_keys)
     axes = observation.axes_lidar
-    by_bias, by_rates = observation.by_range_bias, observation.by_rates
+    by_bias = observation.by_range_bias
     nuisances: dict[int, Array] = {}
     if key_bias is not None and by_bias is not None:
         nuisances[key_bias] = by_bias
-    if key_rates is not None and by_rates is not None:
-        nuisances[key_rates] = -by_rates
+    if key_rates is not None and observation.by_rates is not None:
+        nuisances[key_rates] = -observation.by_rates @ by_rates(_turning(observation))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T, moves = _chain(values, poses, jacobians is not None)
@@ -189,12 +190,18 @@ def with_twist(observation: GroundObservation, R_map_vehicle: Array) -> tuple[Ar
     By another rotation of the vehicle than that of the trajectory; and (3, 3) its derivative by a
     right perturbation of that rotation.
     """
-    V, R_0, by_rates = observation.twist_map, observation.R_map_vehicle, observation.by_rates
-    if V is None or R_0 is None or by_rates is None:
+    V, R_0, by_twist = observation.twist_map, observation.R_map_vehicle, observation.by_rates
+    if V is None or R_0 is None or by_twist is None:
         return np.zeros(3), np.zeros((3, 3))
     twist = turned_twist(R_map_vehicle.T, V)
-    change = by_rates @ (twist - turned_twist(R_0.T, V))
-    return change, by_rates @ twist_by_turn(twist)
+    change = by_twist @ (twist - turned_twist(R_0.T, V))
+    return change, by_twist @ twist_by_turn(twist)
+
+
+def _turning(observation: GroundObservation) -> Array:
+    """(3,) angular velocity in vehicle axes with which the points of an observation were moved."""
+    V, R_0 = observation.twist_map, observation.R_map_vehicle
+    return np.zeros(3) if V is None or R_0 is None else R_0.T @ V[:3]
 
 
 def with_heave(observation: GroundObservation, heave_m: float) -> Array:

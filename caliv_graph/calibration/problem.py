@@ -96,7 +96,7 @@ class Problem:
         views: (J,) clouds of its LiDAR that have the view of each (`targets.cloud.views`); None:
             all differ.
         heave_m: 1 sigma of the heave at each pose.
-        rate_rows: per drive the (6, 6 m) derivatives of its mean rates by its m poses
+        rate_rows: per drive the (RATES, 6 m) derivatives of the errors of its rates by its m poses
             (`trajectory.rates`); none where an odometry gave them.
         cloud_apart_s: (J,) mean time of the points of each cloud after its stamp, to which they
             were moved with the rates of the trajectory, seconds; None: zero.

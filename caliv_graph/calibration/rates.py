@@ -66,9 +66,9 @@ def rates_factor(
     """`r = e - rows d`: the mean rates of some poses are off by e, as these poses are by d.
 
     Args:
-        key: of e, (6,) rad/s and m/s, true rates less those that points were moved with.
+        key: of e, (RATES,) rad/s, m/s and m, true rates less those that points were moved with.
         T_map_vehicle: the poses that gave these rates, by key: where d, right perturbations, is 0.
-        rows: (6, 6 m) of `trajectory.rates.rate_rows`.
+        rows: (RATES, 6 m) of `trajectory.rates.rate_rows`.
     """
     parts = np.split(rows, len(T_map_vehicle), axis=1)
 

@@ -18,6 +18,7 @@ from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
+    key_imu_place,
     key_imu_rotation,
     key_lever_arm,
     key_sensor_offset,
@@ -31,6 +32,7 @@ from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK
 from caliv_graph.trajectory.parameters import (
     GNSS_TIME_OFFSET,
     HEADING_YAW,
+    IMU_PLACE,
     IMU_ROTATION,
     IMU_TIME_OFFSET,
     LEVER_ARM,
@@ -50,6 +52,7 @@ POSE_TIME_OFFSET = "poses.time_offset"
 
 KEYS = {
     LEVER_ARM.name: key_lever_arm(),
+    IMU_PLACE.name: key_imu_place(),
     IMU_ROTATION.name: key_imu_rotation(),
     WHEELS_ROTATION.name: key_wheels_rotation(),
     GNSS_TIME_OFFSET.name: key_sensor_offset(0),
@@ -62,6 +65,7 @@ R_vehicle_wheels, and (1,) seconds."""
 
 NAMES = {
     LEVER_ARM.name: "lever_arm",
+    IMU_PLACE.name: "imu_place",
     IMU_ROTATION.name: "imu_rotation",
     WHEELS_ROTATION.name: "wheels_rotation",
     GNSS_TIME_OFFSET.name: "gnss_time_offset",
@@ -83,6 +87,7 @@ USUAL_LATE_S = 0.02
 
 USUAL_SIGMAS = {
     LEVER_ARM.name: DEFAULT_GUESS_SIGMAS[3:],
+    IMU_PLACE.name: DEFAULT_GUESS_SIGMAS[3:],
     IMU_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
     WHEELS_ROTATION.name: DEFAULT_GUESS_SIGMAS[:3],
     **dict.fromkeys([*CLOCKS, POSE_TIME_OFFSET], np.full(1, USUAL_LATE_S)),
@@ -286,6 +291,8 @@ def _uncertain(trajectory: SmoothedTrajectory) -> dict[str, tuple[Array, Array]]
 def _value(trajectory: SmoothedTrajectory, name: str) -> ParameterValue:
     if name == LEVER_ARM.name:
         return np.asarray(trajectory.data.lever_arm)
+    if name == IMU_PLACE.name:
+        return np.asarray(trajectory.data.T_vehicle_imu.translation())
     if name in CLOCKS:
         return np.array([trajectory.data.late_ns.get(CLOCKS[name], 0) / NANOSECONDS_PER_SECOND])
     return trajectory.data.T_vehicle_imu.rotation()

@@ -22,6 +22,9 @@ _UNKNOWN_ARM_SIGMA_M = 2.0
 _LEAST_UNKNOWN_ARM_SIGMA_M = 0.1
 """A smaller sigma of an unknown lever arm is left over from a known one."""
 
+_IMU_SIGMA_M = 0.01
+"""Of the place of an IMU, by a tape measure."""
+
 _ROTATION_SIGMA_DEG = 0.1
 """Of an IMU's mount on a surface that was made for it."""
 
@@ -75,6 +78,11 @@ class ImuConfig(Section):
     """The IMU on the vehicle."""
 
     T_vehicle_imu: ImuPoseConfig = ImuPoseConfig(xyz=(0.0, 0.0, 0.0))
+    xyz_sigma: Positive | None = Field(
+        None,
+        description="metres, sigma of the place of T_vehicle_imu along each vehicle axis; absent: "
+        "0.01, and none where its xyz is zero",
+    )
     rotation_sigma_deg: Positive | None = Field(
         None,
         description="degrees, sigma of the rotation of T_vehicle_imu about each vehicle axis; "
@@ -104,6 +112,12 @@ class ImuConfig(Section):
                 "enter rpy_deg"
             )
         return self
+
+    def place_sigma(self) -> float | None:
+        """Sigma of the IMU's place per axis, metres; None: it is exact."""
+        if self.xyz_sigma is not None:
+            return self.xyz_sigma
+        return _IMU_SIGMA_M if any(self.T_vehicle_imu.xyz) else None
 
     def rotation_sigma_rad(self) -> float | None:
         """Sigma of a rotation that was measured, radians; None: it is exact, or unknown."""

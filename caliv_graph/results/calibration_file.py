@@ -40,10 +40,10 @@ _HEADER = """\
 # determined, sigma_vehicle_axes and the directions of observability: the vehicle's axes, at the
 # LiDAR's origin. `determined` of a pair: the axes of `to`.
 # vehicle: what was measured by hand, as estimated. lever_arm: the GNSS antenna in the vehicle's
-# axes. imu_rotation, wheels_rotation: roll, pitch, yaw of T_vehicle_imu or T_vehicle_wheels, sigmas
-# about the vehicle's axes. *_time_offset: stamps of a sensor less the true times, in the clock of
-# the LiDARs. One per drive: speed_scale, measured over true speeds; heading_yaw, the direction of
-# the baseline of two antennas.
+# axes; imu_place: the IMU. imu_rotation, wheels_rotation: roll, pitch, yaw of T_vehicle_imu or
+# T_vehicle_wheels, sigmas about the vehicle's axes. *_time_offset: stamps of a sensor less the true
+# times, in the clock of the LiDARs. One per drive: speed_scale, measured over true speeds;
+# heading_yaw, the direction of the baseline of two antennas.
 """
 
 

@@ -68,6 +68,7 @@ class VehiclePart(Part):
     """What was measured by hand on the vehicle, and clocks of its sensors, as estimated."""
 
     lever_arm: _ArmPart | None = None
+    imu_place: _ArmPart | None = None
     imu_rotation: _TurnPart | None = None
     wheels_rotation: _TurnPart | None = None
     speed_scale: _ScalesPart | None = None
@@ -85,7 +86,7 @@ class VehiclePart(Part):
             if turn is not None:
                 value, sigma = np.radians(turn.value_deg), np.radians(turn.sigma_deg)
                 out[name] = VehicleParameter(value, sigma, turn.determined, turn.limits)
-        for name in ("lever_arm", "speed_scale", *TIME_OFFSETS):
+        for name in ("lever_arm", "imu_place", "speed_scale", *TIME_OFFSETS):
             found: _ArmPart | _ScalesPart | _ClockPart | None = getattr(self, name)
             if found is not None:
                 value, sigma = np.array(found.value), np.array(found.sigma)

@@ -173,6 +173,8 @@ def _motion_sections(scenario: Scenario) -> dict[str, Any]:
         }
         if any(mounting.rpy_deg) or any(mounting.xyz):
             sections["imu"]["rotation_sigma_deg"] = EXACT_DEG
+        if any(mounting.xyz):
+            sections["imu"]["xyz_sigma"] = EXACT_M
     if scenario.gnss.enabled:
         topics["gnss"] = TOPIC_GNSS
         sections["gnss"] = {"lever_arm": list(scenario.gnss.lever_arm)}

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.patches import DrivePatches, along_surface
+from caliv_graph.structure.patches import DrivePatches, fitted_along
 
 KINDS = 5
 """Of one elevation: the range, m; elevation and azimuth of the beam, rad; and how the first two
@@ -32,9 +32,6 @@ LEAST_APART_RAD = np.radians(0.5)
 MEANS = {RANGE: 1e-4, AZIMUTH: 1e-5}
 """1 sigma of the mean error of all elevations of a LiDAR, by kind, m and rad: that of the ranges is
 its bias, which has a variable of its own, and that of the azimuth is what its yaw means."""
-
-SHORT_M = 0.05
-"""Extent below which a sighting does not show how an error changes along it."""
 
 
 @dataclass(frozen=True)
@@ -138,12 +135,7 @@ def seen_beams(
     np.add.at(total, at.ravel(), weight[:, None, None] * by_point)
 
     of, node = np.divmod(keys, several)
-    S = np.add.reduceat(moments, starts)
-    N = along_surface(S, normals[starts])
-    inner = np.swapaxes(N, 1, 2) @ S @ N
-    inner[:, [1, 2], [1, 2]] += S[:, 3, 3, None] * SHORT_M**2
-    right = np.einsum("eij,eki->ejk", N[of], total)
-    fitted = np.swapaxes(N[of] @ np.linalg.solve(inner[of], right), 1, 2)
+    fitted = fitted_along(np.add.reduceat(moments, starts), normals[starts], total, of)
     begin = np.searchsorted(of, np.arange(len(starts)))
     place = np.arange(len(keys)) - begin[of]
     width = int(place.max(initial=-1)) + 1

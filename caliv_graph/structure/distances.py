@@ -18,6 +18,7 @@ import scipy.linalg
 import scipy.sparse
 
 from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.bends import BENDS
 from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
 from caliv_graph.structure.noise import OWN_STRIP, range_sigmas, robust_weights
@@ -124,7 +125,8 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
     least = 0.5 * usual
     sighting = np.sqrt(np.maximum((OWN_STRIP * usual**2 + total) / (OWN_STRIP + count), least**2))
     strip = np.full(strips.count, np.median(used.nuisances.strip))
-    nuisances = replace(used.nuisances, sighting=sighting, strip=strip)
+    bend = np.where(strips.level, *used.levels().bend_per_m)
+    nuisances = replace(used.nuisances, sighting=sighting, strip=strip, bend=bend)
     weights = robust_weights(own, sightings, nuisances)
     scans = np.zeros((strips.count, layout.lidars), dtype=np.int64)
     np.add.at(scans, (sightings.strip, lidar), weights > 0.0)
@@ -313,9 +315,9 @@ def _measured(
     geometry = geometry_at(problem, here, sightings, layout)
     group = groups_of(sightings, strips)
     repeated = problem.views.count[sightings.scan]
-    same = alike(problem, sightings)
+    same, half_m = alike(problem, sightings), strips.half_widths_m[sightings.strip]
     rows = whitened(
-        geometry, sightings, group, repeated, same, other.nuisances, weights, layout.size
+        geometry, sightings, group, repeated, same, half_m, other.nuisances, weights, layout.size
     )
     found = _Distances(other, rows)
     offsets = geometry.offsets_m(sightings)
@@ -344,6 +346,9 @@ def _drawn_offsets(
     layout, nuisances = other.layout, other.nuisances
     errors = np.zeros((layout.size, DRAWS))
     errors[: layout.plane] = draws
+    bend = np.tile(nuisances.bend, BENDS * layout.bent)[:, None]
+    bends = slice(layout.bend, layout.surface_error)
+    errors[bends] = bend * rng.standard_normal((len(bend), DRAWS))
     for first, last, sigma in (
         (layout.surface_error, layout.strip_error, nuisances.surface),
         (layout.strip_error, layout.size, nuisances.strip[0]),
@@ -376,17 +381,21 @@ class _Distances:
         for k in np.unique(other.strip_of):
             at = np.flatnonzero(other.strip_of == k)
             plane = layout.plane + 3 * k + np.arange(3)
+            bends = layout.bend + layout.strips * np.arange(BENDS * layout.bent) + k
             own = layout.strip_error + layout.strips * other.lidar_of[at] + k
-            columns = np.concatenate([plane, own])
+            columns = np.concatenate([plane, bends, own])
             part = H[columns]
             A = part[:, columns].toarray()
-            A += np.diag([TILT_PRIOR_RAD**-2.0] * 2 + [PLACE_PRIOR_M**-2.0] * (1 + len(at)))
+            sigmas = [TILT_PRIOR_RAD] * 2 + [PLACE_PRIOR_M]
+            sigmas += [other.nuisances.bend[k]] * len(bends) + [PLACE_PRIOR_M] * len(at)
+            A += np.diag(np.array(sigmas) ** -2.0)
             inverse = np.linalg.inv(A)
-            gain = inverse[3:]
+            first = len(plane) + len(bends)
+            gain = inverse[first:]
             self.distances_m[at] = -(gain @ right[columns])
             self.by_solve[at] = gain @ part[:, : layout.plane].toarray()
             self._by_surface[at] = gain @ part[:, surface].toarray()
-            self._noise[np.ix_(at, at)] = inverse[3:, 3:]
+            self._noise[np.ix_(at, at)] = inverse[first:, first:]
             # The hub errs on the strip as the others do.
             strip = other.nuisances.strip[k] ** 2 * (np.eye(len(at)) + 1.0)
             self._noise[np.ix_(at, at)] += strip

@@ -11,6 +11,7 @@ from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.beams import KINDS
+from caliv_graph.structure.bends import BENDS
 from caliv_graph.trajectory.imu import exp_so3
 
 BIASES = 3
@@ -27,6 +28,7 @@ class Nuisances:
         ground: bias of a LiDAR on all level strips: asphalt is darker than walls are.
         surface: bias of a LiDAR on a surface: colour, gloss.
         strip: (K,) how far a LiDAR sees each strip from where others do: bumps, other beams.
+        bend: (K,) of the bends of each strip, 1/m (`bends.py`); not metres.
         sighting: (K,) offset of each strip from scan to scan.
         shared: offset of a surface from scan to scan, which its strips share: incidence, and how
             the beams fall, change along a wall slowly.
@@ -47,6 +49,7 @@ class Nuisances:
     shared: float
     repeated: float
     beams: Array = field(default_factory=lambda: np.zeros((0, KINDS)))
+    bend: Array = field(default_factory=lambda: np.zeros(0))
     jitter_s: float = 0.0
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
@@ -59,12 +62,12 @@ class State:
         R_map_vehicle: (M, 3, 3).
         t_map_vehicle: (M, 3) metres.
         moved: (6 M + p,) where poses and parameters of the vehicle are from the pose prior, T0 of
-            a pose: `T0^-1 T` in `chart`; with the errors of the rates, 6 more.
+            a pose: `T0^-1 T` in `chart`; with the errors of the rates, `rates` more.
         T_vehicle_lidar: n poses.
         offsets_s: (n,) time offsets; zero where they are not free.
         centres_map: (K, 3) points of the planes.
         normals_map: (K, 3).
-        errors: (D,) errors of LiDARs, height and tilt at their coordinates; else zero.
+        errors: (D,) errors of LiDARs, height and tilt, bends at their coordinates; else zero.
         chart: of `moved`.
     """
 
@@ -84,12 +87,13 @@ class Layout:
     """Where each variable is among the D coordinates of the system.
 
     In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
-    were moved (6, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth with
-    incidence, and that on the ground (3), errors of its beams at some elevations (`KINDS` each, if
-    there are any), error of the vehicle's height and tilt above the ground (3), errors of the
+    were moved (`rates`, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth
+    with incidence, and that on the ground (3), errors of its beams at some elevations (`KINDS`,
+    if there are any), error of the vehicle's height and tilt above the ground (3), errors of the
     angular velocity within the scans at each pose, if there are any (3), jitter of the stamp of
     each scan, if there is any; and what belongs to one surface each: planes (two tilts, offset),
-    bias of each LiDAR on each surface, offset of each LiDAR on each strip.
+    bends of each strip, if they are bent (`BENDS` times K), bias of each LiDAR on each surface,
+    offset of each LiDAR on each strip.
     """
 
     poses: int
@@ -101,6 +105,7 @@ class Layout:
     rates: int = 0
     turns: int = 0
     beams: tuple[int, ...] = ()
+    bent: bool = False
 
     @property
     def strips(self) -> int:
@@ -158,9 +163,14 @@ class Layout:
         return self.error + BIASES * self.lidars
 
     @property
+    def bend(self) -> int:
+        """First bend of a strip; after the planes."""
+        return self.plane + 3 * self.strips
+
+    @property
     def surface_error(self) -> int:
         """First bias of a LiDAR on a surface."""
-        return self.plane + 3 * self.strips
+        return self.bend + BENDS * self.strips * self.bent
 
     @property
     def strip_error(self) -> int:
@@ -173,18 +183,19 @@ class Layout:
         return self.strip_error + self.lidars * self.strips
 
     def error_columns(self) -> IntArray:
-        """Coordinates of all errors of the LiDARs, in the order of `error_sigmas`."""
+        """Coordinates of all errors of the LiDARs and of bends, as in `error_sigmas`."""
         return np.concatenate(
-            [np.arange(self.error, self.standing), np.arange(self.surface_error, self.size)]
+            [np.arange(self.error, self.standing), np.arange(self.bend, self.size)]
         )
 
     def error_sigmas(self, nuisances: Nuisances) -> Array:
-        """1 sigma of each error of the LiDARs."""
+        """1 sigma of each error of the LiDARs and each bend."""
         of_lidar = np.array([nuisances.bias, nuisances.incidence, nuisances.ground])
         return np.concatenate(
             [
                 np.tile(of_lidar, self.lidars),
                 nuisances.beams.ravel(),
+                np.tile(nuisances.bend, BENDS * self.bent),
                 np.full(self.lidars * self.surfaces, nuisances.surface),
                 np.tile(nuisances.strip, self.lidars),
             ]
@@ -195,6 +206,7 @@ class Layout:
         surface = np.array(self.surface_of, dtype=np.int64)
         strips = np.arange(self.strips)
         where = [self.plane + 3 * strips + i for i in range(3)]
+        where += [self.bend + self.strips * i + strips for i in range(BENDS * self.bent)]
         where += [self.strip_error + self.strips * i + strips for i in range(self.lidars)]
         own = [np.arange(self.surfaces)] * self.lidars
         of = np.concatenate([surface] * len(where) + own)
@@ -215,7 +227,7 @@ def stepped(state: State, layout: Layout, d: Array) -> State:
     for i, (xi, step) in enumerate(zip(before, steps, strict=True)):
         moved[6 * i : 6 * i + 6] = state.chart.coordinates(state.chart.pose(xi).compose(step))
     tangents = d[layout.extrinsic : layout.error].reshape(-1, 6)
-    planes = d[layout.plane : layout.surface_error].reshape(-1, 3)
+    planes = d[layout.plane : layout.bend].reshape(-1, 3)
     errors = np.concatenate([layout.error_columns(), np.arange(layout.standing, layout.plane)])
     all_errors = state.errors.copy()
     all_errors[errors] += d[errors]

@@ -12,8 +12,9 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from caliv_graph.config.range_errors import RangeErrors, log_normal, size_weights
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import KINDS, mean_weight
+from caliv_graph.structure.bends import BENDS, USUAL_PER_M
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
@@ -63,6 +64,9 @@ less is stated of the ranges."""
 
 MOST_STRIP_M = 0.05
 """Its largest sigma: what is seen farther apart is no one strip."""
+
+LEAST_BEND_PER_M, MOST_BEND_PER_M = 2e-4, 0.1
+"""Smallest and largest sigma of a bend: 0.1 mm and 5 cm in the middle of 2 m."""
 
 SPREADS = (3.0, 6.0)
 """Offset of a sighting in sigmas up to which it has full weight, and from which it has none."""
@@ -153,6 +157,7 @@ def fitted_noise(
     nuisances: Nuisances,
     errors: Array,
     ranges: RangeErrors,
+    level: BoolArray,
 ) -> Nuisances:
     """Noise levels from the residuals at an estimate (REML: what was fitted is counted).
 
@@ -170,6 +175,7 @@ def fitted_noise(
         nuisances: the levels that it was solved with.
         errors: (D,) estimated errors of the LiDARs.
         ranges: what is stated of the errors of the ranges.
+        level: (K,) which strips are ground; it bends otherwise than walls.
     """
     offsets = geometry.offsets_m(sightings)
     sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)
@@ -200,6 +206,7 @@ def fitted_noise(
         ),
         repeated=1.0 if one else float(np.clip(again / (common**2 + shared), 0.0, 1.0)),
         beams=_beam_sigmas(covariance, layout, nuisances.beams, errors, ranges),
+        bend=_bend_sigmas(solve, layout, nuisances.bend, errors, level, one),
         jitter_s=_jitter_sigma(solve, layout, nuisances.jitter_s, errors),
     )
 
@@ -368,9 +375,50 @@ def _strip_sigmas(
     own = slice(layout.strip_error, layout.size)
     known = np.clip(_known(solve, layout, own, before), 0.0, 1.0).sum(axis=0)
     square = (errors[own].reshape(layout.lidars, -1) ** 2).sum(axis=0)
-    usual = float(np.median(before))
-    own_weight = (STRIP_FREEDOM + known) / (STRIP_FREEDOM + square / usual**2)
-    common = (STRIP_USUAL_M**2 + float(own_weight @ square)) / (1.0 + float(known.sum()))
-    common = float(np.clip(common, LEAST_M**2, MOST_STRIP_M**2))
+    return _heavy_tailed(known, square, before, STRIP_USUAL_M, (LEAST_M, MOST_STRIP_M))
+
+
+def _bend_sigmas(
+    solve: Callable[[Array], Array],
+    layout: Layout,
+    before: Array,
+    errors: Array,
+    level: BoolArray,
+    one_view: bool,
+) -> Array:
+    """(K,) 1 sigma of the bends of each strip, in the same way; ground and others apart.
+
+    Seen from one place a bend looks like another extrinsic: it is at least as large as usual.
+    """
+    if not layout.bent:
+        return before
+    own = slice(layout.bend, layout.surface_error)
+    known = np.clip(_known(solve, layout, own, before), 0.0, 1.0).sum(axis=0)
+    square = (errors[own].reshape(BENDS, -1) ** 2).sum(axis=0)
+    limits = (USUAL_PER_M if one_view else LEAST_BEND_PER_M, MOST_BEND_PER_M)
+    out = np.array(before)
+    for of in (level, ~level):
+        if of.any():
+            out[of] = _heavy_tailed(known[of], square[of], before[of], USUAL_PER_M, limits)
+    return out
+
+
+def _heavy_tailed(
+    known: Array, square: Array, before: Array, usual: float, limits: tuple[float, float]
+) -> Array:
+    """(K,) sigmas of errors of K strips, each of its own size about a common one.
+
+    Args:
+        known: (K,) how many errors of each the data know.
+        square: (K,) sum of their squares.
+        before: (K,) the sigmas before.
+        usual: what counts as one more error of one more strip.
+        limits: smallest and largest sigma.
+    """
+    least, most = np.square(limits).tolist()
+    middle = float(np.median(before))
+    own_weight = (STRIP_FREEDOM + known) / (STRIP_FREEDOM + square / middle**2)
+    common = (usual**2 + float(own_weight @ square)) / (1.0 + float(known.sum()))
+    common = float(np.clip(common, least, most))
     out = (STRIP_FREEDOM * common + square) / (STRIP_FREEDOM + known)
-    return np.asarray(np.sqrt(np.clip(out, LEAST_M**2, MOST_STRIP_M**2)))
+    return np.asarray(np.sqrt(np.clip(out, least, most)))

@@ -165,6 +165,28 @@ class DrivePatches:
         return np.asarray(u * np.sqrt(np.maximum(squares, 0.0))[:, None])
 
 
+SHORT_M = 0.05
+"""Extent below which a sighting does not show how an error changes along it."""
+
+
+def fitted_along(moments: Array, normals: Array, total: Array, of: IntArray | None = None) -> Array:
+    """(E, k, 4) functions of h that are linear along a surface, nearest to given ones.
+
+    Args:
+        moments: (Q, 4, 4) of the points.
+        normals: (Q, 3) of their surfaces.
+        total: (E, k, 4) moments of the points times the functions.
+        of: (E,) whose points; None: those of each (E = Q).
+    """
+    N = along_surface(moments, normals)
+    inner = np.swapaxes(N, 1, 2) @ moments @ N
+    inner[:, [1, 2], [1, 2]] += moments[:, 3, 3, None] * SHORT_M**2
+    if of is not None:
+        N, inner = N[of], inner[of]
+    right = np.einsum("eij,eki->ejk", N, total)
+    return np.asarray(np.swapaxes(N @ np.linalg.solve(inner, right), 1, 2))
+
+
 def along_surface(moments: Array, normals: Array) -> Array:
     """(N, 4, 3) functions of h: one, and the two places (m) along a surface about the middle.
 

@@ -23,8 +23,9 @@ class PosePrior:
     Minus the log-likelihood is `d^T information d / 2 - gradient^T d`. d are coordinates of the
     poses (`chart`; rotation then translation, rad and m), then p of the parameters: metres of the
     lever arm, right perturbation of R_vehicle_imu, seconds of a clock; and, where points were moved
-    by the rates of the trajectory, of the errors of these (6, rad/s and m/s). Heave of the body, a
-    sigma of its own at each pose, is part of the poses; the priors of the parameters are apart.
+    by the rates of the trajectory, of the errors of these (`trajectory.rates.RATES`). Heave of the
+    body, a sigma of its own at each pose, is part of the poses; the priors of the parameters are
+    apart.
 
     Attributes:
         stamps_ns: (m,) of the poses, strictly increasing.
@@ -32,8 +33,8 @@ class PosePrior:
         parameters: name of the input (`gnss.lever_arm`, `imu.T_vehicle_imu`) -> the value at which
             d is zero: (3,) metres, R_vehicle_imu, or (1,) seconds. Empty: none is uncertain.
         information: (6 m + p, 6 m + p), positive definite with `parameter_information` added; with
-            rates 6 more.
-        gradient: (6 m + p,), or 6 more.
+            rates RATES more.
+        gradient: (6 m + p,), or RATES more.
         parameter_information: (p, p) of the priors of the parameters, one for all drives.
         parameter_offset: (p,) the present values less the means of these priors: the priors add
             `parameter_information` and `-parameter_information parameter_offset`.
@@ -51,7 +52,7 @@ class PosePrior:
 
     @property
     def rates(self) -> int:
-        """Number of coordinates of the errors of the rates, the last ones: 6 or none."""
+        """Number of coordinates of the errors of the rates, the last ones: RATES or none."""
         poses, parameters = 6 * len(self.stamps_ns), len(self.parameter_information)
         return len(self.gradient) - poses - parameters
 

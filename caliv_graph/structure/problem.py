@@ -9,7 +9,12 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.range_errors import UNSTATED, RangeErrors
-from caliv_graph.geometry.se3 import right_to_vehicle_axes, stack, vehicle_axes_difference
+from caliv_graph.geometry.se3 import (
+    right_to_vehicle_axes,
+    stack,
+    tangent_axes,
+    vehicle_axes_difference,
+)
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.layout import Layout, State
 from caliv_graph.structure.patches import DrivePatches
@@ -52,6 +57,7 @@ class Problem:
         turn_rad_s: (P, 3) 1 sigma of the errors of the angular velocity within the scans at each of
             the P poses with a scan, vehicle axes (`turns.py`); empty: points are taken at once.
         beam_nodes: elevations of each LiDAR at which its beams err (`beams.py`); empty: none do.
+        bent: whether strips are bent (`bends.py`); else they are flat.
     """
 
     patches: DrivePatches
@@ -70,6 +76,7 @@ class Problem:
     accelerations: Array | None = None
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
     beam_nodes: tuple[Array, ...] = ()
+    bent: bool = False
 
     @property
     def turn_of_scan(self) -> IntArray:
@@ -167,7 +174,12 @@ def placed_sightings(
 ) -> Sightings:
     """Sightings of strips; `range_sigma_m` (L,) is the noise along the beam of each LiDAR."""
     own = np.where(strips.of_patch >= 0, strips.of_patch, 0)
-    normals = np.einsum("nji,nj->ni", placed.R_map_lidar, strips.normals_map[own])
+    back = np.swapaxes(placed.R_map_lidar, 1, 2)
+    normals = np.einsum("nij,nj->ni", back, strips.normals_map[own])
+    bent = None
+    if problem.bent and strips.count:
+        centres = np.einsum("nij,nj->ni", back, strips.centres_map[own] - placed.t_map_lidar)
+        bent = centres, tangent_axes(strips.normals_map)[own] @ placed.R_map_lidar
     return sightings_of(
         problem.patches,
         placed.moments_at_stamp,
@@ -177,6 +189,7 @@ def placed_sightings(
         range_sigma_m,
         placed.T_vehicle_lidar,
         problem.beam_nodes,
+        bent,
     )
 
 
@@ -191,6 +204,7 @@ def layout_of(problem: Problem, strips: Strips) -> Layout:
         surface_of=tuple(strips.surface.tolist()),
         turns=problem.turn_rad_s.size,
         beams=tuple(map(len, problem.beam_nodes)),
+        bent=problem.bent,
     )
 
 

@@ -13,10 +13,12 @@ import scipy.sparse
 from caliv_graph.geometry.se3 import skew, stack, tangent_axes, twist_by_turn
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import KINDS
+from caliv_graph.structure.bends import BENDS
 from caliv_graph.structure.layout import BIASES, Layout, State
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.strips import LEVEL
 from caliv_graph.trajectory.imu import exp_so3
+from caliv_graph.trajectory.rates import by_rates
 
 DENT_RAD = 0.05
 """Largest angle of a strip to its tile that is a dent of the ground. What is steeper, such as a
@@ -245,6 +247,10 @@ def geometry_of(
         own = layout.beam + KINDS * beams.node[:, :, None] + np.arange(KINDS)
         own = own.reshape(q, -1)
         moved.append((beams.by.reshape(q, -1, 4), own, state.errors[own]))
+    if layout.bent:
+        own = layout.bend + layout.strips * np.arange(BENDS) + strip[:, None]
+        bends = np.zeros((q, BENDS, 4)) if sightings.bends is None else sightings.bends
+        moved.append((bends, own, state.errors[own]))
     for by, own, value in moved:
         plain += np.einsum("qc,qci->qi", value, by)
         parts.append(by)
@@ -286,8 +292,9 @@ def _by_motion(
     if layout.rates:
         # Points taken tau later: X Exp(tau e) in the place of X.
         own = np.broadcast_to(layout.rate + np.arange(layout.rates), (q, layout.rates))
-        by_rates = sightings.time_s[:, None, None] * by_pose
-        out.append((by_rates, own, state.moved[own]))
+        turning = np.zeros((q, 3)) if twists is None else twists[:, :3]
+        by_errors = np.swapaxes(by_rates(turning), 1, 2) @ by_pose
+        out.append((sightings.time_s[:, None, None] * by_errors, own, state.moved[own]))
     if twists is None or not (layout.offsets or layout.jitters):
         return out
     by_time = -np.einsum("qi,qij->qj", twists, by_pose)[:, None]

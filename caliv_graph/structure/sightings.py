@@ -10,6 +10,7 @@ import numpy as np
 from caliv_graph.config.range_errors import GRAZING_COS
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.beams import SeenBeams, elevations, seen_beams
+from caliv_graph.structure.bends import seen_bends
 from caliv_graph.structure.patches import DrivePatches, along_surface
 from caliv_graph.structure.strips import Strips
 
@@ -18,11 +19,6 @@ ROUGHNESS_M = 0.003
 
 BEAM_RAD = 3e-4
 """1 sigma of the direction of a beam: a tenth of the usual divergence of 3 mrad."""
-
-TILT_LENGTH_M = 1.0
-"""Distance over which the error of a sighting changes by its own sigma: half a strip. How beams
-fall on joints, edges and bumps differs over a strip as much as from scan to scan."""
-
 
 MIN_COS = GRAZING_COS
 """Smallest cosine of the incidence: beyond, footprints are metres long."""
@@ -43,6 +39,7 @@ class Sightings:
         time_s: (Q,) weighted mean of the times of the points, seconds after the scan's stamp.
         T_vehicle_lidar: of each LiDAR, with which points of other times were moved to the stamps.
         beams: what errors of the beams add; None: they have none.
+        bends: (Q, BENDS, 4) what bends of the strips add (`bends.py`); None: strips are flat.
     """
 
     scan: IntArray
@@ -52,6 +49,7 @@ class Sightings:
     time_s: Array
     T_vehicle_lidar: tuple[gtsam.Pose3, ...]
     beams: SeenBeams | None = None
+    bends: Array | None = None
 
     @property
     def count(self) -> int:
@@ -73,6 +71,7 @@ class Sightings:
             noise=self.noise[keep],
             time_s=self.time_s[keep],
             beams=self.beams and self.beams.only(keep),
+            bends=None if self.bends is None else self.bends[keep],
         )
 
 
@@ -105,6 +104,7 @@ def sightings_of(
     range_sigma_m: Array,
     T_vehicle_lidar: tuple[gtsam.Pose3, ...],
     beam_nodes: tuple[Array, ...] = (),
+    bent: tuple[Array, Array] | None = None,
 ) -> Sightings:
     """Adds up the patches of each strip in each scan.
 
@@ -117,6 +117,8 @@ def sightings_of(
         range_sigma_m: (L,) noise along the beam of each LiDAR.
         T_vehicle_lidar: of each LiDAR, with which points were moved to the stamp.
         beam_nodes: elevations of each LiDAR at which its beams err (`beams.py`); empty: none do.
+        bent: centres (N, 3) of their strips in that frame, and axes (N, 2, 3), of patches on a
+            strip; None: strips are flat.
     """
     own = np.flatnonzero(strips.of_patch >= 0)
     places = moments_at_stamp[own, :3, 3]
@@ -141,6 +143,11 @@ def sightings_of(
         beams = seen_beams(
             beam_nodes, elevation, lidar, centres, normals_at_stamp[own], weighted, starts
         )
+    bends = None
+    if bent is not None:
+        middles, axes = (part[own] for part in bent)
+        of_strip, normals = strips.of_patch[own], normals_at_stamp[own]
+        bends = seen_bends(weighted, middles, axes, normals, of_strip, starts)
     noise = np.zeros_like(moments)
     of_patch = weight * moments_at_stamp[own, 3, 3]
     along = np.sqrt(weight)[:, None] * scatter_at_stamp[own]
@@ -153,25 +160,24 @@ def sightings_of(
         time_s=np.add.reduceat(of_patch * patches.time_s[own], starts) / moments[:, 3, 3],
         T_vehicle_lidar=T_vehicle_lidar,
         beams=beams,
+        bends=bends,
     )
 
 
 def without_own_error(
-    sightings: Sightings, normals_lidar: Array, offset_m: Array, tilt_m: Array
+    sightings: Sightings, normals_lidar: Array, offset_m: Array, tilt_rad: Array
 ) -> tuple[Array, Array]:
     """Moments (Q, 4, 4) without the own error of each sighting; and what noise adds.
 
     That error is an offset and two tilts: `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`. However many
     points it has, a sighting knows its strip no better than `offset_m` (Q,) at its middle, and its
-    tilt no better than `tilt_m` (Q,) over `TILT_LENGTH_M`. `normals_lidar` (Q, 3) at the scan's
-    stamp.
+    tilt no better than `tilt_rad` (Q,). `normals_lidar` (Q, 3) at the scan's stamp.
     """
     S = sightings.moments
     N = along_surface(S, normals_lidar)
-    N[:, :, 1:] /= TILT_LENGTH_M
     SN = S @ N
     inner = np.swapaxes(N, 1, 2) @ SN
-    inner[:, range(3), range(3)] += np.stack([offset_m, tilt_m, tilt_m], axis=1) ** -2.0
+    inner[:, range(3), range(3)] += np.stack([offset_m, tilt_rad, tilt_rad], axis=1) ** -2.0
     K = N @ np.linalg.solve(inner, np.swapaxes(SN, 1, 2))
     left = np.eye(4) - K
     out = S @ left

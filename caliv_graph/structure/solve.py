@@ -13,6 +13,7 @@ import numpy as np
 from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.beams import KINDS
+from caliv_graph.structure.bends import USUAL_PER_M
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
 from caliv_graph.structure.jitter import jitter_sigma_s, told_clocks, told_of_jitters
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
@@ -92,6 +93,7 @@ class Estimate:
                 group,
                 repeated,
                 alike(problem, sightings),
+                self.strips.half_widths_m[sightings.strip],
                 self.nuisances,
                 self.weights,
                 self.layout.size,
@@ -102,6 +104,23 @@ class Estimate:
             self.nuisances,
             problem.standing,
             self.stands(),
+        )
+
+    def levels(self) -> Levels:
+        """Its noise levels, for the strips of another round."""
+        found = self.nuisances
+        of_kinds = (self.strips.level, ~self.strips.level)
+        ground, others = (
+            float(np.median(found.bend[of])) if of.any() else USUAL_PER_M for of in of_kinds
+        )
+        return Levels(
+            sighting_m=float(np.median(found.sighting)),
+            strip_m=float(np.median(found.strip)),
+            shared_m=found.shared,
+            surface_m=found.surface,
+            bias_m=found.bias,
+            beams=found.beams,
+            bend_per_m=(ground, others),
         )
 
     def stands(self) -> Stands:
@@ -129,7 +148,8 @@ class Solved(Estimate):
 class Levels:
     """Noise levels, alike for all strips, with which a round begins: those of `Nuisances`.
 
-    `beams` is (N, KINDS), or (1, KINDS) where all elevations are alike.
+    `beams` is (N, KINDS), or (1, KINDS) where all elevations are alike; `bend_per_m` is that of
+    level strips, and of others.
     """
 
     sighting_m: float
@@ -138,6 +158,7 @@ class Levels:
     surface_m: float
     bias_m: float
     beams: Array
+    bend_per_m: tuple[float, float] = (USUAL_PER_M, USUAL_PER_M)
 
     @staticmethod
     def first(sighting_m: float, strip_m: float, shared_m: float, ranges: RangeErrors) -> Levels:
@@ -156,18 +177,6 @@ class Levels:
         if not elevations:
             return self.beams[:0]
         return np.broadcast_to(self.beams, (elevations, self.beams.shape[1]))
-
-    @staticmethod
-    def of(found: Nuisances) -> Levels:
-        """What a round has found, for the strips of the next one."""
-        return Levels(
-            sighting_m=float(np.median(found.sighting)),
-            strip_m=float(np.median(found.strip)),
-            shared_m=found.shared,
-            surface_m=found.surface,
-            bias_m=found.bias,
-            beams=found.beams,
-        )
 
 
 def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
@@ -189,7 +198,7 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         if found is None:
             return None
         found = _settled(found, steps)
-        levels, state = Levels.of(found.nuisances), found.state
+        levels, state = found.levels(), found.state
     if found is None:
         return None
     gradient, clocks = None, Clocks()
@@ -211,7 +220,7 @@ def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved 
     Raises:
         SolveError: the system is singular.
     """
-    problem = replace(problem, beam_nodes=())
+    problem = replace(problem, beam_nodes=(), bent=False)
     range_sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     state, levels = _rough(problem, start, range_sigma)
     found = _round(problem, state, range_sigma, GATES_M[0], levels)
@@ -228,7 +237,7 @@ def _rough(
     """The estimate after the rounds with wide gates, of some of the scans, and noise levels."""
     some, poses = with_scans(problem, some_scans(problem.patches))
     # Channels differ by less than these gates; their errors take half of the time of a step.
-    some = replace(some, beam_nodes=())
+    some = replace(some, beam_nodes=(), bent=False)
     rough = first_state(some, start)
     levels = Levels.first(
         FIRST_SIGHTING_M, FIRST_SIGHTING_M, FIRST_SIGHTING_M, problem.range_errors
@@ -239,7 +248,7 @@ def _rough(
         if found is None:
             break
         found = _settled(found, steps=2)
-        levels = replace(Levels.of(found.nuisances), beams=levels.beams)
+        levels = replace(found.levels(), beams=levels.beams, bend_per_m=levels.bend_per_m)
         rough, beam = found.state, found.layout.beam
     if len(rough.errors):
         rough = replace(rough, errors=np.insert(rough.errors, np.full(more, beam), 0.0))
@@ -354,6 +363,7 @@ def _round(
         shared=levels.shared_m,
         repeated=0.0,
         beams=levels.of_beams(sum(layout.beams)),
+        bend=np.where(strips.level, *levels.bend_per_m),
         turn_rad_s=problem.turn_rad_s,
     )
     weights = np.ones(sightings.count)
@@ -396,6 +406,7 @@ def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
         found.nuisances,
         state.errors,
         problem.range_errors,
+        found.strips.level,
     )
     weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
     step = d[layout.extrinsic : layout.error]

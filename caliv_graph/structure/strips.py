@@ -15,6 +15,10 @@ from caliv_graph.products import Array, BoolArray, IntArray
 CELL_M = 2.0
 """Edge of the cells of the map that strips are found in: walls are not flat beyond 2 m."""
 
+GROUND_CELL_M = 0.7
+"""The same of level ground, the only surface that is seen in rings, each LiDAR's elsewhere: crown,
+waves and bumps between these pass for a height of the LiDARs. Patches are half a metre wide."""
+
 WIDE_ANGLE_RAD = math.radians(25.0)
 WIDE_GATE_M = 0.3
 NARROW_ANGLE_RAD = math.radians(6.0)
@@ -63,6 +67,16 @@ class Strips:
     def count(self) -> int:
         """K."""
         return len(self.centres_map)
+
+    @property
+    def half_widths_m(self) -> Array:
+        """(K,) half the edge of the cell of each."""
+        return np.where(self.level, 0.5 * GROUND_CELL_M, 0.5 * CELL_M)
+
+    @property
+    def level(self) -> BoolArray:
+        """(K,) whether each is level: ground."""
+        return np.asarray(self.normals_map[:, 2] > LEVEL)
 
 
 def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: float) -> Strips:
@@ -113,12 +127,13 @@ def _cells(positions: Array, normals: Array) -> tuple[IntArray, IntArray]:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     axis = np.abs(normals).argmax(axis=1)
     each = np.arange(len(axis))
-    cell = np.floor(positions / CELL_M).astype(np.int64)
+    edge = np.where(normals[:, 2] > LEVEL, GROUND_CELL_M, CELL_M)
+    cell = np.floor(positions / edge[:, None]).astype(np.int64)
     cell[each, axis] = 0
     side = np.where(normals[each, axis] > 0.0, axis, -1 - axis)
     key = np.zeros(len(axis), dtype=np.int64)
-    for part in (side, *cell.T):
-        # In the order of the four numbers: one sort of integers.
+    for part in ((edge > GROUND_CELL_M).astype(np.int64), side, *cell.T):
+        # In the order of the five numbers: one sort of integers.
         key = key * (np.ptp(part) + 1) + part - part.min()
     order = np.argsort(key, kind="stable")
     return order, np.cumsum(np.diff(key[order], prepend=-1) > 0) - 1

@@ -62,7 +62,7 @@ def system_of(
     J, r = mean_rows(layout.beams, layout.beam, state.errors)
     sparse, right = sparse + J.T @ J, right - J.T @ r
     weight = np.zeros(layout.size)
-    weight[layout.plane : layout.surface_error] = np.tile(
+    weight[layout.plane : layout.bend] = np.tile(
         [TILT_PRIOR_RAD**-2.0, TILT_PRIOR_RAD**-2.0, PLACE_PRIOR_M**-2.0], layout.strips
     )
     errors = layout.error_columns()

@@ -200,6 +200,7 @@ def problem_of(
         range_errors=range_errors(config.noise),
         turn_rad_s=turn_sigmas(patches, pose_of_scan, trajectory),
         beam_nodes=beam_nodes(patches),
+        bent=True,
     )
 
 

@@ -14,29 +14,48 @@ import gtsam
 import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
-from caliv_graph.geometry.se3 import twist_by_turn
+from caliv_graph.geometry.se3 import skew, twist_by_turn
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
-RATES = 6
-"""Angular velocity (rad/s) and velocity (m/s) in the map, both along the vehicle's axes."""
+RATES = 9
+"""Errors of the angular velocity (rad/s) and velocity (m/s) in the map, both along the vehicle's
+axes; and how far the vehicle's origin is from the point of the body whose velocity that is (m)."""
 
 MOST_TURN_RAD = 1.0
 """Largest rotation between two poses whose difference counts: the motion between them is taken as
 one of constant velocities. A step of a radian is long, a chord 4 percent short of its arc."""
 
-RATE_SIGMAS = np.repeat([1e-5, 1e-4], 3)
-"""1 sigma of what ties the mean rates to the poses, rad/s and m/s. None is meant: over 0.1 s it
-moves a point 20 m away by 0.02 mm."""
+RATE_SIGMAS = np.repeat([1e-5, 1e-4, 1e-3], 3)
+"""1 sigma of what ties them to the poses, rad/s, m/s and m. None is meant: over 0.1 s it moves a
+point 20 m away by 0.02 mm, and at 0.5 rad/s a shift by 0.05 mm."""
+
+LEAST_TURNING_RAD_S = 0.01
+"""Root mean square of the angular velocity about its mean below which a shift of the origin is not
+told apart from a mean velocity. What it would move is then a thousandth of it per sweep."""
+
+
+def by_rates(angular_velocity: Array) -> Array:
+    """(..., 6, RATES) what the errors make of a twist, at angular velocities (..., 3), rad/s.
+
+    A point of the body that is s further on has the velocity `v + omega x s`.
+    """
+    out = np.zeros((*angular_velocity.shape[:-1], 6, RATES))
+    out[..., range(6), range(6)] = 1.0
+    out[..., 3:, 6:] = skew(angular_velocity)
+    return out
 
 
 def rate_rows(
     stamps_ns: Sequence[int] | IntArray, T_map_vehicle: Sequence[gtsam.Pose3]
 ) -> Array | None:
-    """(6, 6 m) derivatives of the mean rates by right perturbations of m poses.
+    """(RATES, 6 m) derivatives of the errors of the rates by right perturbations of m poses.
 
-    The rates between two poses are `Log(X_i^-1 X_j) / (t_j - t_i)`; their mean is over time. What a
+    The rates between two poses are `Log(X_i^-1 X_j) / (t_j - t_i)`. The errors are those that fit
+    their change best over time: a constant twist, and a shift of the vehicle's origin. An antenna
+    whose place is known to a centimetre shifts the origin along the body, and with it the velocity
+    by `omega x s`, to the other side in the other curve: it is no mean velocity. What a
     turn of the pose changes of the velocities in vehicle axes, which those in the map are not, is
     taken out: it is another at every speed and in every curve, and follows from each pose by
     itself.
@@ -49,7 +68,7 @@ def rate_rows(
         None, if no two poses follow each other within `MOST_TURN_RAD`.
     """
     m = len(stamps_ns)
-    out = np.zeros((RATES, 6 * m))
+    pull, known = np.zeros((RATES, 6 * m)), np.zeros((RATES, RATES))
     total_s = 0.0
     for i in range(m - 1):
         step = T_map_vehicle[i].between(T_map_vehicle[i + 1])
@@ -57,15 +76,21 @@ def rate_rows(
             continue
         # Log(Exp(-d_i) step Exp(d_j)); the time by which each difference is divided is its weight.
         by_later = np.asarray(gtsam.Pose3.LogmapDerivative(step))
-        out[:, 6 * i + 6 : 6 * i + 12] += by_later
-        out[:, 6 * i : 6 * i + 6] -= by_later @ step.inverse().AdjointMap()
-        half = 0.5 * twist_by_turn(np.asarray(gtsam.Pose3.Logmap(step)))
-        out[:, 6 * i : 6 * i + 3] -= half
-        out[:, 6 * i + 6 : 6 * i + 9] -= half
-        total_s += int(stamps_ns[i + 1] - stamps_ns[i]) / NANOSECONDS_PER_SECOND
-    if not math.isclose(total_s, 0.0):
-        return out / total_s
-    return None
+        by_poses = np.hstack([-by_later @ step.inverse().AdjointMap(), by_later])
+        motion = np.asarray(gtsam.Pose3.Logmap(step))
+        half = 0.5 * twist_by_turn(motion)
+        by_poses[:, :3] -= half
+        by_poses[:, 6:9] -= half
+        seconds = int(stamps_ns[i + 1] - stamps_ns[i]) / NANOSECONDS_PER_SECOND
+        by_errors = by_rates(motion[:3] / seconds)
+        pull[:, 6 * i : 6 * i + 12] += by_errors.T @ by_poses
+        known += seconds * by_errors.T @ by_errors
+        total_s += seconds
+    if math.isclose(total_s, 0.0):
+        return None
+    shift = np.arange(6, RATES)
+    known[shift, shift] += LEAST_TURNING_RAD_S**2 * total_s
+    return np.asarray(np.linalg.solve(known, pull))
 
 
 def rate_rows_of_drives(
@@ -93,10 +118,10 @@ def with_rates(information: Array, gradient: Array, rows: Array) -> tuple[Array,
     Args:
         information: (n, n), right perturbations of m poses first.
         gradient: (n,).
-        rows: (6, 6 m) of `rate_rows`.
+        rows: (RATES, 6 m) of `rate_rows`.
 
     Returns:
-        (n + 6, n + 6) and (n + 6,); with the rates eliminated, what was given.
+        (n + RATES, n + RATES) and (n + RATES,); with the rates eliminated, what was given.
     """
     n, m = len(gradient), rows.shape[1]
     tie = np.zeros((RATES, n + RATES))

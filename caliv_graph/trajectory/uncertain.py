@@ -24,6 +24,7 @@ from caliv_graph.trajectory.marginals import node_ordering
 from caliv_graph.trajectory.parameters import (
     GNSS_TIME_OFFSET,
     HEADING_YAW,
+    IMU_PLACE,
     IMU_ROTATION,
     LEVER_ARM,
     SECOND_ARM,
@@ -105,6 +106,9 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
         out.append(UncertainParameter(LEVER_ARM, np.full(3, arm), np.zeros(3)))
     if data.rotation_sigmas is not None:
         out.append(UncertainParameter(mount_rotation(data), data.rotation_sigmas, np.zeros(3)))
+    place = data.config.imu.place_sigma()
+    if place is not None and data.wheels is None and _has_place(data):
+        out.append(UncertainParameter(IMU_PLACE, np.full(3, place), np.zeros(3)))
     out += _clocks(data)
     wheels = data.config.wheels
     if data.wheels is not None:
@@ -123,6 +127,11 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
         arms = np.full(3, heading.lever_arm_sigma)
         out.append(UncertainParameter(SECOND_ARM, arms, np.zeros(3)))
     return tuple(out)
+
+
+def _has_place(data: SmootherInput) -> bool:
+    """Whether another sensor is where an IMU is not."""
+    return data.positions is not None or data.motion.twist is not None
 
 
 def _clocks(data: SmootherInput) -> list[UncertainParameter]:

@@ -28,6 +28,7 @@ ahead leaves four undetermined, and five past walls without ground, the yaw bein
 
 PARAMETER_KEYS = {
     "lever_arm": "gnss.lever_arm",
+    "imu_place": "imu.T_vehicle_imu.xyz",
     "imu_rotation": "imu.T_vehicle_imu",
     "wheels_rotation": "wheels.T_vehicle_wheels",
     "heading_yaw": "heading.yaw_deg",

@@ -20,7 +20,7 @@ from caliv_graph.products import Recording
 from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.structure.noise import range_sigmas
 from caliv_graph.structure.read import level, read_patches
-from caliv_graph.structure.solve import Levels, solve_structure
+from caliv_graph.structure.solve import solve_structure
 from caliv_graph.structure.term import aligned_start, problem_of, usable
 from caliv_graph.trajectory.select import VehicleTrajectory, noise_scales, smooth_trajectories
 
@@ -98,7 +98,7 @@ def solved_walls(
             own,
             trajectory,
             (stamps, unstack(found.state.R_map_vehicle, found.state.t_map_vehicle)),
-            (Levels.of(found.nuisances), range_sigmas(patches, config.noise.lidar_range_m)),
+            (found.levels(), range_sigmas(patches, config.noise.lidar_range_m)),
             begin_ns,
             height_m,
         )

@@ -30,6 +30,7 @@ from caliv_graph.conventions import (
 )
 from caliv_graph.geometry.se3 import retract_vehicle_axes
 from caliv_graph.products import Array
+from caliv_graph.trajectory.rates import RATES, by_rates
 from tests.calibration.problems import correlated_information, numerical_jacobian
 from tests.samples import MOUNTINGS, pose
 
@@ -67,7 +68,7 @@ def check_jacobians(
     assert list(factor.keys()) == list(keys)
     np.testing.assert_allclose(b, -error(values), atol=1e-9)
     assert 2.0 * factor.error(values) == pytest.approx(np.sum(error(values) ** 2))
-    sizes = [1 if key == LATE else 6 for key in keys]
+    sizes = [{LATE: 1, V: RATES}.get(key, 6) for key in keys]
     for key, size, end in zip(keys, sizes, np.cumsum(sizes).tolist(), strict=True):
         numerical = numerical_jacobian(error, values, key, size=size)
         scale = np.abs(numerical).max()
@@ -115,7 +116,7 @@ def test_jacobians_of_a_cloud_that_wrong_rates_moved(offset_m: float) -> None:
     values = values_of(
         C=random_pose(rng, offset_m), X=random_pose(rng, offset_m), E=random_pose(rng, 2.0)
     )
-    values.insert(V, 0.1 * rng.normal(size=6))
+    values.insert(V, 0.1 * rng.normal(size=RATES))
     used, twist = random_pose(rng, 2.0), rng.normal(size=6)
     R = gtsam.Rot3.Expmap(1e-2 * rng.normal(size=3)).compose(values.atPose3(X).rotation())
     motion = CloudMotion(twist, R.matrix(), apart_s=0.05, T_vehicle_lidar=used)
@@ -124,7 +125,8 @@ def test_jacobians_of_a_cloud_that_wrong_rates_moved(offset_m: float) -> None:
     stamped = used.inverse().compose(gtsam.Pose3.Expmap(0.05 * twist)).compose(used)
     to_now = values.atPose3(X).rotation().matrix().T @ R.matrix()
     now = np.concatenate([to_now @ twist[:3], to_now @ twist[3:]])
-    true = gtsam.Pose3.Expmap(0.05 * (now + values.atVector(V))).compose(values.atPose3(E))
+    wrong = by_rates(now[:3]) @ values.atVector(V)
+    true = gtsam.Pose3.Expmap(0.05 * (now + wrong)).compose(values.atPose3(E))
     Z, _ = predict_cloud((C, X, V, E), values, motion)
     there = values.atPose3(C).compose(values.atPose3(X)).compose(true).transformFrom(point)
     assert Z.transformFrom(stamped.transformFrom(point)) == pytest.approx(there)
@@ -154,7 +156,7 @@ def test_a_late_cloud_of_a_vehicle_that_accelerates(late_s: float, apart_s: floa
     values.insert(LATE, np.array([late_s]))
     keys = [C, X, LATE, E]
     if apart_s:
-        values.insert(V, np.zeros(6))
+        values.insert(V, np.zeros(RATES))
         keys.insert(3, V)
     motion = CloudMotion(
         np.array([0.0, 0.0, 0.2, 2.0, 0.0, 0.0]),
@@ -184,7 +186,7 @@ def test_a_turn_of_the_vehicle_frame_changes_no_cloud(keys: tuple[int, ...]) -> 
     """
     rng = np.random.default_rng(8)
     values = values_of(C=random_pose(rng, 9.0), X=random_pose(rng, 9.0), E=random_pose(rng, 2.0))
-    values.insert(V, np.zeros(6))
+    values.insert(V, np.zeros(RATES))
     values.insert(LATE, np.array([0.03]))
     motion = CloudMotion(
         np.array([0.0, 0.0, 0.3, 2.0, 0.0, 0.0]),
@@ -205,18 +207,40 @@ def test_a_turn_of_the_vehicle_frame_changes_no_cloud(keys: tuple[int, ...]) -> 
     check_jacobians(factor, values, keys)
 
 
+def test_a_shift_of_the_vehicle_frame_changes_no_cloud() -> None:
+    """By 5 cm, as by an antenna whose place is wrong: the shift of the rates follows."""
+    rng = np.random.default_rng(8)
+    values = values_of(C=random_pose(rng, 9.0), X=random_pose(rng, 9.0), E=random_pose(rng, 2.0))
+    values.insert(V, np.zeros(RATES))
+    motion = CloudMotion(
+        np.array([0.02, 0.01, 0.3, 2.0, 0.0, 0.0]),
+        values.atPose3(X).rotation().matrix(),
+        apart_s=0.05,
+        T_vehicle_lidar=values.atPose3(E),
+    )
+    keys = (C, X, V, E)
+    before, _ = predict_cloud(keys, values, motion)
+    shift = np.array([0.05, -0.03, 0.02])
+    moved = gtsam.Pose3(gtsam.Rot3(), shift)
+    values.update(X, values.atPose3(X).compose(moved))
+    values.update(E, moved.inverse().compose(values.atPose3(E)))
+    assert not predict_cloud(keys, values, motion)[0].equals(before, 1e-4)
+    values.update(V, np.concatenate([np.zeros(6), shift]))
+    assert predict_cloud(keys, values, motion)[0].equals(before, 1e-12)
+
+
 def test_rates_of_a_drive_follow_from_its_poses() -> None:
     rng = np.random.default_rng(7)
     poses = {X: random_pose(rng, 30.0), key_vehicle(1): random_pose(rng, 30.0)}
-    factor = rates_factor(V, poses, rng.normal(size=(6, 12)))
+    factor = rates_factor(V, poses, rng.normal(size=(RATES, 12)))
     values = gtsam.Values()
     for key, T in poses.items():
         values.insert(key, T)
-    values.insert(V, np.zeros(6))
+    values.insert(V, np.zeros(RATES))
     assert factor.error(values) == pytest.approx(0.0, abs=1e-15)
     for key, T in poses.items():
         values.update(key, T.retract(0.1 * rng.normal(size=6)))
-    values.update(V, rng.normal(size=6))
+    values.update(V, rng.normal(size=RATES))
     check_jacobians(factor, values, (*poses, V))
 
 

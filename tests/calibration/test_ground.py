@@ -68,6 +68,7 @@ from caliv_graph.products import (
 from caliv_graph.simulation import load_scenario, simulate_drive
 from caliv_graph.targets.ground.measure import measure_grounds
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
+from caliv_graph.trajectory.rates import RATES
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.uncertainty.observability import scaling
 from tests.calibration.problems import Case, make_case, moved, predictions
@@ -297,7 +298,7 @@ def test_jacobians(offset_m: float) -> None:
             twist_map=np.array([0.1, -0.2, 0.5, 2.0, -1.0, 0.1]),
             R_map_vehicle=random_values(seed + 9, 1.0)[0].atPose3(X).rotation().matrix(),
         )
-        values.insert(key_rates(0), np.random.default_rng(seed).normal(size=6))
+        values.insert(key_rates(0), np.random.default_rng(seed).normal(size=RATES))
         check_jacobians(
             ground_plane_factor((X, E), G, anchor, moved, key_rates=key_rates(0)), values
         )

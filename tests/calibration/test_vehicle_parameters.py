@@ -19,7 +19,7 @@ from caliv_graph.calibration.vehicle_parameters import (
     parameter_priors,
 )
 from caliv_graph.config.model import Config
-from caliv_graph.conventions import key_imu_rotation, key_lever_arm
+from caliv_graph.conventions import key_imu_place, key_imu_rotation, key_lever_arm
 from caliv_graph.products import Array, TargetCloud, TargetObservation
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -28,7 +28,9 @@ from tests.trajectory.motions import Course, config_for, eight_drive, mounted_as
 COURSE = Course(eight_drive(16.0), rough=1.0)
 SENSORS = replace(mounted_askew(), twist_hz=50.0)
 CONFIG = config_for(
-    SENSORS, gnss={"lever_arm": list(SENSORS.lever_arm)}, imu={"rotation_sigma_deg": None}
+    SENSORS,
+    gnss={"lever_arm": list(SENSORS.lever_arm)},
+    imu={"rotation_sigma_deg": None, "xyz_sigma": None},
 )
 WANTED = stamps(16.0, 0.5, 0.3)
 
@@ -51,10 +53,10 @@ def problem_of(trajectories: list[SmoothedTrajectory], config: Config = CONFIG) 
 
 
 def dense(problem: Problem) -> tuple[Array, Array]:
-    """Information and right-hand side of the motion graph: poses, lever arm, rotation."""
+    """Information and right-hand side of the motion graph: poses, lever arm, place, rotation."""
     values = initial_values(problem, [gtsam.Pose3()] * problem.clouds)
     ordering = gtsam.Ordering()
-    for key in (*problem.pose_keys(), key_lever_arm(), key_imu_rotation()):
+    for key in (*problem.pose_keys(), key_lever_arm(), key_imu_place(), key_imu_rotation()):
         ordering.push_back(key)
     H, b = motion_graph(problem).linearize(values).hessian(ordering)
     return np.asarray(H), np.asarray(b).ravel()
@@ -93,16 +95,14 @@ def test_several_drives_share_one_prior() -> None:
     one, other, both = (
         problem_of(list(d)) for d in ((drive(1),), (drive(2),), (drive(1), drive(2)))
     )
-    last = slice(-6, None)
+    last = slice(-9, None)
 
     informations = [marginal(dense(p)[0], last) for p in (one, other, both)]
 
-    prior = np.zeros((6, 6))
-    prior[:3, :3] = np.eye(3) * 0.01**-2.0
-    prior[3:, 3:] = np.eye(3) * np.radians(0.1) ** -2.0
+    prior = np.diag(np.repeat([0.01**-2.0, np.radians(0.1) ** -2.0], [6, 3]))
     expected = informations[0] + informations[1] - prior
     np.testing.assert_allclose(informations[2], expected, rtol=1e-6, atol=1e-3)
-    assert motion_graph(both).kinds.count("vehicle_parameter") == 2
+    assert motion_graph(both).kinds.count("vehicle_parameter") == 3
 
 
 def test_an_antenna_of_unknown_height_lifts_the_map_and_nothing_tells_its_height() -> None:
@@ -129,7 +129,8 @@ def test_an_antenna_of_unknown_height_lifts_the_map_and_nothing_tells_its_height
     # What tells x and y of it is as it was.
     along = trajectory.sigmas_of("gnss.lever_arm")
     assert along is not None
-    prior = np.concatenate([np.zeros(z - 2), np.full(3, 0.5), np.full(3, 1.0 / np.radians(0.1))])
+    known = np.repeat([0.5, 1e7, 1.0 / np.radians(0.1)], 3)  # arm, place and rotation of the IMU
+    prior = np.concatenate([np.zeros(z - 2), known])
     cov = np.linalg.inv(term.information + np.diag(prior**2))
     assert np.sqrt(np.diag(cov)[z - 2 : z]) == pytest.approx(along[:2], rel=0.05)
 
@@ -181,7 +182,7 @@ def test_the_factor_predicts_the_poses_of_a_moved_parameter(name: str) -> None:
         expected.append(gtsam.Pose3.Logmap(before.between(after)))
     scale = np.abs(expected).max()
     assert scale > 1e-4
-    np.testing.assert_allclose(seen, expected, atol=0.05 * scale)
+    np.testing.assert_allclose(seen, expected, atol=0.06 * scale)  # products of a turn and a shift
 
 
 @pytest.mark.parametrize(

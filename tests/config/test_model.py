@@ -479,6 +479,19 @@ def test_the_sigma_of_the_imu_s_rotation(imu: dict[str, object], sigma_deg: floa
     assert sigma == (None if sigma_deg is None else pytest.approx(math.radians(sigma_deg)))
 
 
+@pytest.mark.parametrize(
+    ("imu", "sigma_m"),
+    [
+        ({}, None),
+        ({"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [0, 0, 90]}}, None),
+        ({"T_vehicle_imu": {"xyz": [0, 0, 0]}, "xyz_sigma": 0.02}, 0.02),
+        ({"T_vehicle_imu": {"xyz": [0.5, 0, 0], "rpy_deg": None}}, 0.01),
+    ],
+)
+def test_the_sigma_of_the_imu_s_place(imu: dict[str, object], sigma_m: float | None) -> None:
+    assert ImuConfig.model_validate(imu).place_sigma() == sigma_m
+
+
 def test_what_is_unknown_has_no_sigma_left_over_from_when_it_was_known() -> None:
     """Taken as the prior of the guess, it gave an IMU that is 30 degrees off with exit 4."""
     with pytest.raises(ValueError, match=r"known to 0\.1 degrees: remove rotation_sigma_deg"):

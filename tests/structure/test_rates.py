@@ -14,7 +14,7 @@ from caliv_graph.structure.slow_errors import told_of_errors
 from caliv_graph.structure.solve import Solved, solve_roughly
 from caliv_graph.structure.term import term_of
 from caliv_graph.structure.turns import turn_sigmas
-from caliv_graph.trajectory.rates import rate_rows
+from caliv_graph.trajectory.rates import by_rates, rate_rows
 from tests.structure.test_solve import GUESS_SIGMAS, between, information_of, problem_of, solve
 from tests.structure.yards import TRUE, Noise, draw_prior, figure_eight, poses, yard
 from tests.trajectory.test_variances import base
@@ -36,7 +36,7 @@ def swept() -> Problem:
     d = np.array([s.localCoordinates(T) for s, T in zip(prior.T_map_vehicle, true, strict=True)])
     problem = problem_of(yard(), path, 11, NOISE)
     assert problem.twists is not None
-    off = np.tile(rows @ d.ravel(), (POSES, 1))
+    off = by_rates(problem.twists[:, :3]) @ (rows @ d.ravel())
     off[:, :3] += np.cross(problem.twists[:, :3], d[:, :3])
     off[:, 3:] += np.cross(problem.twists[:, 3:], d[:, :3])
     return with_sweeps(replace(problem, prior=prior), off)

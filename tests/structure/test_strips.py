@@ -56,7 +56,7 @@ def test_a_surface_on_the_boundary_of_cells_is_one_strip() -> None:
     """Two would have patches whose errors have the same sign."""
     along = np.linspace(0.3, 1.7, 8)
     around = np.where(EIGHT % 2, 0.001, -0.001)
-    ground = np.column_stack([along, np.full(8, 1.0), around])
+    ground = np.column_stack([np.linspace(0.75, 1.35, 8), np.full(8, 1.0), around])
     wall = np.column_stack([4.0 + around, along, np.full(8, 1.0)])
     for centres, normal in ((ground, [0.0, 0.0, 1.0]), (wall, [-1.0, 0.0, 0.0])):
         strips = find_strips(*patches(centres, np.tile(normal, (8, 1))), EIGHT, 0.1)
@@ -83,7 +83,7 @@ def test_what_few_scans_see_is_no_strip() -> None:
 
 
 def test_ground_is_a_surface_for_each_tile() -> None:
-    x, y = (g.ravel() for g in np.meshgrid(np.arange(1.0, 12.0, 2.0), np.arange(1.0, 6.0, 2.0)))
+    x, y = (g.ravel() for g in np.meshgrid(0.35 + 2.1 * np.arange(6), 0.35 + 2.1 * np.arange(3)))
     centres = np.repeat(np.column_stack([x, y, np.full(len(x), 0.5)]), 8, axis=0)
     normals = np.tile([0.0, 0.0, 1.0], (len(centres), 1))
     strips = find_strips(*patches(centres, normals), np.tile(EIGHT, len(x)), 0.1)

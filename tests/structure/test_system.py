@@ -10,15 +10,24 @@ import scipy.sparse
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import stack
+from caliv_graph.structure.bends import BENDS
 from caliv_graph.structure.elimination import eliminated, factor_of, solved
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
 from caliv_graph.structure.residuals import Geometry, geometry_of
 from caliv_graph.structure.rows import whitened
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.standing import Standing, Stands, standing_rows, stands_of
+from caliv_graph.trajectory.rates import RATES
 
 LAYOUT = Layout(
-    poses=2, parameters=3, offsets=(1,), lidars=2, surface_of=(0, 1, 1), jitters=2, rates=6
+    poses=2,
+    parameters=3,
+    offsets=(1,),
+    lidars=2,
+    surface_of=(0, 1, 1),
+    jitters=2,
+    rates=RATES,
+    bent=True,
 )
 LIDAR = np.array([0, 1, 1, 0])
 POSE = np.array([0, 0, 1, 1])
@@ -34,11 +43,11 @@ def state_of(rng: np.random.Generator) -> State:
     errors = np.zeros(LAYOUT.size)
     errors[LAYOUT.error :] = 0.01 * rng.standard_normal(LAYOUT.size - LAYOUT.error)
     errors[LAYOUT.jitter : LAYOUT.plane] *= 0.1  # milliseconds
-    errors[LAYOUT.plane : LAYOUT.surface_error] = 0.0
+    errors[LAYOUT.plane : LAYOUT.bend] = 0.0
     return State(
         R_map_vehicle=R,
         t_map_vehicle=t,
-        moved=np.append(np.zeros(15), 1e-3 * rng.standard_normal(6)),
+        moved=np.append(np.zeros(15), 1e-3 * rng.standard_normal(RATES)),
         T_vehicle_lidar=tuple(gtsam.Pose3.Expmap(v) for v in rng.uniform(-0.5, 0.5, (2, 6))),
         offsets_s=np.array([0.0, 0.02]),
         centres_map=np.array([[8.0, 1.0, 0.0], [1.0, 9.0, 1.0], [2.0, -7.0, 0.5]]),
@@ -59,7 +68,15 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
     h = np.concatenate([rng.uniform(3.0, 9.0, (4, 3)), np.ones((4, 1))], axis=1)
     moments = h[:, :, None] * h[:, None, :]
     made_with = state.T_vehicle_lidar
-    sightings = Sightings(POSE, STRIP, moments, np.zeros_like(moments), np.array(TIME_S), made_with)
+    sightings = Sightings(
+        POSE,
+        STRIP,
+        moments,
+        np.zeros_like(moments),
+        np.array(TIME_S),
+        made_with,
+        bends=rng.standard_normal((4, BENDS, 4)),
+    )
     return state, sightings, h, 0.5 * rng.standard_normal((2, 6))
 
 
@@ -67,7 +84,7 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
     ("first", "count"),
     [
         (0, 12),
-        (LAYOUT.rate, 6),
+        (LAYOUT.rate, RATES),
         (LAYOUT.offset, 1),
         (LAYOUT.extrinsic, 12),
         (LAYOUT.error, 6),
@@ -124,7 +141,7 @@ def test_a_turn_of_the_vehicle_frame_changes_no_distance(
     """
     state, sightings, _, twists = world
     offsets = () if swept else (0, 1)
-    layout = replace(LAYOUT, offsets=offsets, rates=6 if swept else 0, jitters=0)
+    layout = replace(LAYOUT, offsets=offsets, rates=RATES if swept else 0, jitters=0)
     offsets_s = np.zeros(2) if swept else np.array([0.02, 0.03])
     chart = PoseChart(PIVOT)
     late = replace(
@@ -286,6 +303,7 @@ def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them()
             np.arange(count),
             own,
             count * own,
+            np.ones(count),
             nuisances,
             np.ones(count),
             layout.size,

@@ -199,7 +199,7 @@ def config_for(sensors: Sensors, **sections: Mapping[str, object]) -> Config:
     rpy = np.degrees(sensors.T_vehicle_imu.rotation().rpy())
     known: dict[str, object] = {} if not any(sensors.lever_arm) else {"lever_arm_sigma": 1e-7}
     same = sensors.T_vehicle_imu.equals(gtsam.Pose3(), 1e-9)
-    turned: dict[str, object] = {} if same else {"rotation_sigma_deg": 1e-6}
+    turned: dict[str, object] = {} if same else {"rotation_sigma_deg": 1e-6, "xyz_sigma": 1e-7}
     raw: dict[str, object] = {
         "lidars": {"front": {"topic": "/front", "initial": {"xyz": [2, 0, 2]}}},
         **sections,

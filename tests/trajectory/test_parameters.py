@@ -14,6 +14,7 @@ from caliv_graph.products import Array, GnssFixes, ImuSamples
 from caliv_graph.trajectory.columns import whitening
 from caliv_graph.trajectory.parameters import (
     GNSS_TIME_OFFSET,
+    IMU_PLACE,
     IMU_ROTATION,
     IMU_TIME_OFFSET,
     LEVER_ARM,
@@ -48,8 +49,9 @@ def smoothed_with(parameter: InputParameter, d: Array) -> SmoothedTrajectory:
         arm = np.array(CONFIG.gnss.lever_arm) + d
         return smooth_trajectory(MOTION, config_of({"gnss": {"lever_arm": tuple(arm)}}), WANTED)
     T = CONFIG.imu.T_vehicle_imu.pose()
-    rpy = gtsam.Rot3.Expmap(d).compose(T.rotation()).rpy()
-    mounting = {"xyz": tuple(T.translation()), "rpy_deg": tuple(np.degrees(rpy))}
+    turn, shift = (d, np.zeros(3)) if parameter is IMU_ROTATION else (np.zeros(3), d)
+    rpy = gtsam.Rot3.Expmap(turn).compose(T.rotation()).rpy()
+    mounting = {"xyz": tuple(T.translation() + shift), "rpy_deg": tuple(np.degrees(rpy))}
     return smooth_trajectory(MOTION, config_of({"imu": {"T_vehicle_imu": mounting}}), WANTED)
 
 
@@ -86,10 +88,11 @@ def test_derivatives_are_whitened_as_the_residuals_are() -> None:
     [
         (LEVER_ARM, np.array([0.02, -0.03, 0.01])),
         (IMU_ROTATION, np.array([1.0, -2.0, 1.5]) * 1e-3),
+        (IMU_PLACE, np.array([0.02, -0.01, 0.03])),
         (GNSS_TIME_OFFSET, np.array([3e-3])),
         (IMU_TIME_OFFSET, np.array([-2e-4])),
     ],
-    ids=["lever arm", "imu rotation", "gnss clock", "imu clock"],
+    ids=["lever arm", "imu rotation", "imu place", "gnss clock", "imu clock"],
 )
 def test_the_joint_gaussian_predicts_what_a_moved_parameter_does(
     parameter: InputParameter, d: Array

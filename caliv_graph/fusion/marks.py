@@ -20,6 +20,9 @@ MARKS_OF_TOPIC = 16
 """The smallest hashes of the messages of a topic: of a copy that has a part of them, the marks are
 marks of the whole as often as that part says (bottom-k sketches; Cohen and Kaplan, 2007)."""
 
+HASHED_ROWS = 1024
+"""Messages that are hashed at a time: the memory of the hashes does not grow with the drive."""
+
 FEWEST_SHARED = 3
 """Marks that two drives share by no chance. Exact poses of two simulated drives may share the one
 at the start."""
@@ -29,13 +32,19 @@ def drive_marks(motion: MotionData) -> tuple[str, ...]:
     """The marks of a drive; none without motion data. No YAML reader takes them for numbers."""
     out = []
     for stamps, values in _topics(motion):
-        rows = np.ascontiguousarray(values, np.float64)
-        hashes = {
-            "m" + hashlib.blake2b(row.tobytes(), digest_size=6, key=b"%d" % stamp).hexdigest()
-            for stamp, row in zip(stamps.tolist(), rows, strict=True)
-        }
-        out += sorted(hashes)[:MARKS_OF_TOPIC]
+        smallest: list[str] = []
+        for begin in range(0, len(stamps), HASHED_ROWS):
+            some = slice(begin, begin + HASHED_ROWS)
+            smallest = sorted({*smallest, *_hashes(stamps[some], values[some])})[:MARKS_OF_TOPIC]
+        out += smallest
     return tuple(out)
+
+
+def _hashes(stamps_ns: IntArray, values: Array) -> Iterator[str]:
+    """The hash of each of n messages, of stamps (n,) and values (n, k)."""
+    rows = np.ascontiguousarray(values, np.float64)
+    for stamp, row in zip(stamps_ns.tolist(), rows, strict=True):
+        yield "m" + hashlib.blake2b(row.tobytes(), digest_size=6, key=b"%d" % stamp).hexdigest()
 
 
 def _topics(motion: MotionData) -> Iterator[tuple[IntArray, Array]]:

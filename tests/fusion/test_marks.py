@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -66,6 +67,19 @@ def test_exact_poses_that_start_at_one_place_are_of_two_drives() -> None:
     assert drive_marks(poses(0.01)) == drive_marks(poses(0.01))
     first, second = (frozenset(drive_marks(poses(turn))) for turn in (0.01, -0.01))
     assert not are_one(first, second)
+
+
+def test_marks_are_the_smallest_hashes_of_all_messages() -> None:
+    """However many of them are hashed at a time."""
+    motion = recorded(count=3000)
+    imu = motion.imu
+    assert imu is not None
+    rows = np.hstack([imu.angular_velocity, imu.specific_force])
+    hashes = [
+        "m" + hashlib.blake2b(row.tobytes(), digest_size=6, key=b"%d" % stamp).hexdigest()
+        for stamp, row in zip(imu.stamps_ns.tolist(), rows, strict=True)
+    ]
+    assert drive_marks(replace(motion, gnss=None)) == tuple(sorted(hashes)[:MARKS_OF_TOPIC])
 
 
 def test_a_drive_without_motion_data_has_no_marks() -> None:

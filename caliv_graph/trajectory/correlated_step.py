@@ -41,12 +41,17 @@ class WithErrors:
 
 
 def step_with_errors(
-    settled: Settled, nodes: IntArray, dropped: IntArray, errors: Sequence[CorrelatedError]
+    settled: Settled,
+    linear: gtsam.GaussianFactorGraph,
+    nodes: IntArray,
+    dropped: IntArray,
+    errors: Sequence[CorrelatedError],
 ) -> WithErrors:
     """The estimate moved by one step of states, parameters and correlated errors together.
 
     Args:
         settled: without the errors.
+        linear: its graph, linearised.
         nodes: (n,) stamps.
         dropped: (k,) indices of fixes that are left out.
         errors: at least one.
@@ -55,7 +60,6 @@ def step_with_errors(
         TrajectoryError: the graph is singular.
     """
     data, estimate, n = settled.data, settled.estimate, len(nodes)
-    linear = estimate.graph.factors.linearize(estimate.values)
     none = np.zeros((n, AXES * len(errors)))
     start = chain_with_errors(settled, linear, nodes, errors, none)
     chain, gradient = without_right_side(start)

@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -50,22 +51,36 @@ def position_factor(
     if delay_s == 0.0:
         return gtsam.GPSFactorArm(key_imu, position_map, offset_imu, noise)
     shift = np.array([0.0, 0.0, -0.5 * gravity_m_s2 * delay_s**2]) - position_map
-    skew_offset = -skew(offset_imu)
-    by_velocity = delay_s * np.eye(3)
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        T = values.atPose3(key_imu)
-        R = T.rotation().matrix()
-        if jacobians is not None:
-            J = np.empty((3, 6))
-            J[:, :3] = R @ skew_offset
-            J[:, 3:] = R
-            jacobians[0] = J
-            jacobians[1] = by_velocity
-        velocity = values.atVector(key_velocity)
-        return np.asarray(T.translation() + delay_s * velocity + R @ offset_imu + shift)
-
+    known = np.array([*offset_imu, *shift, delay_s])
+    error = partial(_position_error, key_imu, key_velocity, known)
     return gtsam.CustomFactor(noise, [key_imu, key_velocity], error)
+
+
+def _position_error(
+    key_imu: int,
+    key_velocity: int,
+    known: Array,
+    _: gtsam.CustomFactor,
+    values: gtsam.Values,
+    jacobians: list[Array] | None,
+) -> Array:
+    """Residual (3,) of `position_factor`; `known` (7,) are q, what is added, and dt.
+
+    One array each: there are ten such factors to the second of a drive, and what they consist of
+    stays in pieces when they are gone.
+    """
+    offset_imu, shift, delay_s = known[:3], known[3:6], known[6]
+    T = values.atPose3(key_imu)
+    R = T.rotation().matrix()
+    if jacobians is not None:
+        x, y, z = offset_imu.tolist()
+        J = np.empty((3, 6))
+        J[:, :3] = R @ np.array(((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0)))
+        J[:, 3:] = R
+        jacobians[0] = J
+        jacobians[1] = delay_s * np.eye(3)
+    velocity = values.atVector(key_velocity)
+    return np.asarray(T.translation() + delay_s * velocity + R @ offset_imu + shift)
 
 
 def velocity_factor(
@@ -83,23 +98,34 @@ def velocity_factor(
     the measurements (`measurements.NodeVelocities`); `noise` has the 3 dimensions of r; `scale` is
     k, measured over true velocity.
     """
-    gained = scale * gravity_m_s2 * delay_s
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        back = values.atPose3(key_imu).rotation().matrix().T
-        moving, down = scale * (back @ values.atVector(key_velocity)), -back[:, 2]
-        if jacobians is not None:
-            # `skew`, written out: there is one such factor per message of the wheels.
-            turned = []
-            for x, y, z in (moving.tolist(), down.tolist()):
-                turned.append(np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))))
-            out = np.zeros((3, 6))
-            out[:, :3] = turned[0] + gained @ turned[1]
-            jacobians[0] = out
-            jacobians[1] = scale * back
-        return np.asarray(moving + gained @ down - velocity_imu)
-
+    known = np.vstack([scale * gravity_m_s2 * delay_s, velocity_imu])
+    error = partial(_velocity_error, key_imu, key_velocity, known, scale)
     return gtsam.CustomFactor(noise, [key_imu, key_velocity], error)
+
+
+def _velocity_error(
+    key_imu: int,
+    key_velocity: int,
+    known: Array,
+    scale: float,
+    _: gtsam.CustomFactor,
+    values: gtsam.Values,
+    jacobians: list[Array] | None,
+) -> Array:
+    """Residual (3,) of `velocity_factor`; `known` (4, 3) are k g D, and z."""
+    gained, velocity_imu = known[:3], known[3]
+    back = values.atPose3(key_imu).rotation().matrix().T
+    moving, down = scale * (back @ values.atVector(key_velocity)), -back[:, 2]
+    if jacobians is not None:
+        # `skew`, written out: there is one such factor per message of the wheels.
+        turned = []
+        for x, y, z in (moving.tolist(), down.tolist()):
+            turned.append(np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))))
+        out = np.zeros((3, 6))
+        out[:, :3] = turned[0] + gained @ turned[1]
+        jacobians[0] = out
+        jacobians[1] = scale * back
+    return np.asarray(moving + gained @ down - velocity_imu)
 
 
 def position_residuals(

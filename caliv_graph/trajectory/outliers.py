@@ -37,23 +37,27 @@ NOISE_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Robust:
-    """The estimate after rejection, and the input, the fixes with the noise that was used.
+    """What rejection has found: the input, the fixes with the noise that was used.
 
     `dropped` (k,) are the indices of the fixes that were dropped.
     """
 
     data: SmootherInput
-    estimate: Estimate
     dropped: IntArray
     warnings: tuple[str, ...] = ()
 
 
-def solve_without_outliers(data: SmootherInput, nodes: IntArray, states: States) -> Robust:
-    """Solves for all nodes; drops GNSS fixes that white noise does not explain, worst first."""
+def solve_without_outliers(
+    data: SmootherInput, nodes: IntArray, states: States
+) -> tuple[Robust, Estimate]:
+    """Solves for all nodes; drops GNSS fixes that white noise does not explain, worst first.
+
+    The estimate is apart: its graph grows with the drive, and whoever solves anew lets go of it.
+    """
     none = np.zeros(0, dtype=np.int64)
     kernel = data.config.robust.kernel
     if data.positions is None or kernel == "none":
-        return Robust(data, solve(data, nodes, states, none, kernel), none)
+        return Robust(data, none), solve(data, nodes, states, none, kernel)
     estimate = solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE)
     data, states, warnings = _with_fitting_noise(data, nodes, estimate.states)
     dropped, solved_with = none, "roughly"
@@ -75,7 +79,7 @@ def solve_without_outliers(data: SmootherInput, nodes: IntArray, states: States)
     if solved_with != kernel:
         del estimate
         estimate = solve(data, nodes, states, dropped, kernel)
-    return Robust(data, estimate, dropped, tuple(warnings))
+    return Robust(data, dropped, tuple(warnings)), estimate
 
 
 def dropped_warnings(robust: Robust) -> list[str]:

@@ -8,7 +8,6 @@ origin, and without an orientation source its heading is the x axis.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 import gtsam
@@ -76,9 +75,9 @@ def smooth_trajectory(
     nodes = place_nodes(data.inertial, wanted)
     data, states, parameters = _begun(data, nodes)
     errors = errors_in(data, [*configured_errors(config), *correlated])
-    robust = solve_without_outliers(data, nodes, states)
+    robust, estimate = solve_without_outliers(data, nodes, states)
     warnings += [*lines, *robust.warnings]
-    found = robust.estimate.states
+    found = estimate.states
     wrong = (
         estimated_scales(robust.data, nodes, found, robust.dropped, errors)
         if scales is None
@@ -86,21 +85,24 @@ def smooth_trajectory(
     )
     if wrong:
         data = scaled(robust.data, wrong)
-        del robust  # its graph
-        robust = solve_without_outliers(data, nodes, found)
+        del estimate  # its graph
+        robust, estimate = solve_without_outliers(data, nodes, found)
         warnings += robust.warnings
     data, positions = robust.data, robust.data.positions
-    settled = Settled(data, robust.estimate)
     if parameters:
         kernel = data.config.robust.kernel
-        settled = settle(data, nodes, robust.estimate, robust.dropped, kernel, parameters)
+        # Handed over: a second graph beside it would be as large.
+        begun = [estimate]
+        del estimate
+        settled = settle(data, nodes, begun.pop(), robust.dropped, kernel, parameters)
         if late := with_late_clock(settled):
             settled = settle(settled.data, nodes, settled.estimate, robust.dropped, kernel, late)
             # Fixes that the wrong time had put beside the path.
-            robust = solve_without_outliers(settled.data, nodes, settled.estimate.states)
+            robust, estimate = solve_without_outliers(settled.data, nodes, settled.estimate.states)
             late = settled.parameters
-            settled = settle(robust.data, nodes, robust.estimate, robust.dropped, kernel, late)
-        robust = replace(robust, estimate=settled.estimate)  # one graph is enough
+            settled = settle(robust.data, nodes, estimate, robust.dropped, kernel, late)
+    else:
+        settled = Settled(data, estimate)
     linear = settled.estimate.graph.factors.linearize(settled.estimate.values)
     cov_imu, yaw_sigma = covariances_of(linear, settled.data, settled.estimate.states)
     last = _last_step(settled, linear, cov_imu, nodes, robust.dropped, errors)
@@ -165,7 +167,7 @@ def _last_step(
     `linear` is the settled graph, `cov_imu` (n, 6, 6) its covariances where parameters are known.
     """
     if errors:
-        return step_with_errors(settled, nodes, dropped, errors)
+        return step_with_errors(settled, linear, nodes, dropped, errors)
     data = settled.data
     if settled.parameters:
         cov = vehicle_covariances(settled, cov_imu)
@@ -236,8 +238,9 @@ def _roughly_settled(
 ) -> tuple[SmootherInput, States, tuple[UncertainParameter, ...]]:
     """Input, states and parameters with all fixes, outliers among them."""
     none = np.zeros(0, dtype=np.int64)
-    estimate = solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE)
-    settled = settle(data, nodes, estimate, none, "huber", parameters, ROUGH_TOLERANCE)
+    # Its graph is not kept beside those of the solves that follow.
+    begun = [solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE)]
+    settled = settle(data, nodes, begun.pop(), none, "huber", parameters, ROUGH_TOLERANCE)
     return settled.data, settled.estimate.states, settled.parameters
 
 

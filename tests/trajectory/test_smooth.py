@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from dataclasses import replace
 from functools import cache
@@ -15,10 +16,13 @@ from scipy.stats import chi2
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, GnssFixes, ImuSamples, IntArray, MotionData
+from caliv_graph.trajectory import uncertain
+from caliv_graph.trajectory.build import TrajectoryGraph
 from caliv_graph.trajectory.factors import marginal_factor
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.solve import solve
 from tests.trajectory.motions import (
     GRAVITY,
     START_NS,
@@ -550,3 +554,22 @@ def test_stamps_a_breath_apart_share_a_node() -> None:
     smoothed = smooth_trajectory(motion, config_for(Sensors()), wanted)
     assert len(smoothed.trajectory.T_map_vehicle) == len(wanted)
     assert (np.diff(smoothed.nodes_ns) > 1000).all()
+
+
+def test_a_solve_with_parameters_begins_when_the_last_graph_is_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two graphs of a long drive at a time would take twice the memory."""
+    motion = record(ARC, mounted_askew(), 5)
+    typed = {"lever_arm": [1.3, 0.2, 0.8], "lever_arm_sigma": 0.1}
+    alive = []
+
+    def watched(*arguments: object) -> object:
+        graphs = [o for o in gc.get_objects() if isinstance(o, TrajectoryGraph)]
+        alive.append(len(graphs))
+        return solve(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(uncertain, "solve", watched)
+    smooth_trajectory(motion, config_for(mounted_askew(), gnss=typed), stamps(ARC.duration_s, 10.0))
+    assert alive
+    assert set(alive) == {0}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.patches import DrivePatches, fitted_along
 
 KINDS = 5
@@ -46,7 +46,7 @@ class SeenBeams:
     node: IntArray
     by: Array
 
-    def only(self, keep: Array) -> SeenBeams:
+    def only(self, keep: IntArray | BoolArray) -> SeenBeams:
         """Those of some sightings."""
         return SeenBeams(self.node[keep], self.by[keep])
 

@@ -36,7 +36,7 @@ from caliv_graph.structure.rows import PLACE_PRIOR_M, TILT_PRIOR_RAD, Rows, whit
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.solve import GATES_M, Solved
 from caliv_graph.structure.strips import Strips, find_strips
-from caliv_graph.structure.thickness import thickness_m, weighted_alike
+from caliv_graph.structure.thickness import plane_rows, thickness_m, weighted_alike
 
 OWN_SIGHTINGS = 3
 """Fewest sightings of a strip with which a LiDAR's distance is measured."""
@@ -320,12 +320,12 @@ def _measured(
         geometry, sightings, group, repeated, same, half_m, other.nuisances, weights, layout.size
     )
     found = _Distances(other, rows)
-    offsets = geometry.offsets_m(sightings)
-    thickness = thickness_m(geometry, sightings, weights, offsets, strips.count)
+    offsets, by_plane = geometry.offsets_m(sightings), plane_rows(geometry, sightings)
+    thickness = thickness_m(by_plane, sightings, weights, offsets, strips.count)
     if propagated is None or draws is None:
         return Measured(found.distances_m, None, thickness, None)
     drawn = _drawn_offsets(other, geometry, sightings, group, draws, rng)
-    each = thickness_m(geometry, sightings, weights, drawn, strips.count)
+    each = thickness_m(by_plane, sightings, weights, drawn, strips.count)
     return Measured(
         found.distances_m,
         found.covariance(propagated(found.by_solve)),

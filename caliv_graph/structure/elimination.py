@@ -276,6 +276,8 @@ def marginal(H: Array, b: Array, keep: IntArray, rest: IntArray) -> tuple[Array,
     Raises:
         SolveError: `rest` is singular.
     """
+    if not len(rest):
+        return H[np.ix_(keep, keep)], b[keep]
     factor = factor_of(H[np.ix_(rest, rest)], overwrite=True)
     half = half_solved(factor, np.column_stack([H[np.ix_(keep, rest)].T, b[rest]]))
     known = half.T @ half

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
+import scipy.sparse
 
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.elimination import marginal
 from caliv_graph.trajectory.rates import rate_rows, with_rates
 
 POSES_TOGETHER = 32
@@ -87,6 +89,22 @@ class PosePrior:
             rows = np.swapaxes(some, 1, 2) @ self.information[own].reshape(-1, 6, size)
             H[own, :size] += _turned(rows.reshape(-1, size), by_now)
         H[poses:size, :size] += _turned(self.information[poses:], by_now)
+
+    def marginal_at(self, moved: Array, kept: IntArray) -> tuple[Array, Array]:
+        """`at(moved)` on the poses `kept` (k,) and the p parameters, all else eliminated.
+
+        Information (6 k + p, 6 k + p) and gradient. What is eliminated may be in any coordinates:
+        no copy of all of it is made.
+        """
+        m, p = len(self.stamps_ns), len(self.parameter_information)
+        poses = (6 * kept[:, None] + np.arange(6)).ravel()
+        own = np.concatenate([poses, 6 * m + np.arange(p)])
+        rest = np.setdiff1d(np.arange(len(self.gradient)), own)
+        H, b = marginal(self.information, self.gradient, own, rest)
+        blocks = [*self.by_now(moved)[kept], np.eye(p)]
+        J = scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
+        at = J.T @ (J.T @ H).T
+        return 0.5 * (at + at.T), J.T @ (b - H @ moved[own])
 
     def by_now(self, moved: Array) -> Array:
         """(m, 6, 6) derivatives of the poses' part of d at `moved`."""

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.range_errors import GRAZING_COS
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import SeenBeams, elevations, seen_beams
 from caliv_graph.structure.bends import seen_bends
 from caliv_graph.structure.patches import DrivePatches, along_surface
@@ -61,7 +61,7 @@ class Sightings:
         """(Q, 3) weighted mean of the points."""
         return self.moments[:, :3, 3] / self.moments[:, 3, 3, None]
 
-    def only(self, keep: Array) -> Sightings:
+    def only(self, keep: IntArray | BoolArray) -> Sightings:
         """Those of a mask or of indices."""
         return replace(
             self,

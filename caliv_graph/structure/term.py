@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
+from caliv_graph.common.memory import give_back_freed_memory
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.config.range_errors import range_errors
@@ -99,9 +100,12 @@ def structure_terms(
         del prior
         if odometry is not None:
             problem = relative_problem(problem, odometry, start, config)
+        # What the aligning and the solve leave behind in pieces would come on top of what follows.
+        give_back_freed_memory()
         found = solve_structure(problem, start)
         if found is None:
             continue
+        give_back_freed_memory()
         own_odometry = odometry_of([trajectory])
         if own_odometry is None:
             out.append(term_of(found, places))
@@ -228,26 +232,23 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     parameters = np.arange(6 * layout.poses, layout.rate)
     of_motion = np.concatenate([poses, parameters])
     keep = np.concatenate([of_motion, np.arange(layout.offset, layout.error)])
-    H, b = system.H, system.b
-    H_motion, b_motion = prior.at(found.state.moved)
     by_now = _parameters_by_now(found)
-    if layout.parameters:
-        H, b, H_motion, b_motion = (part.copy() for part in (H, b, H_motion, b_motion))
-        # The graph of the calibration has the priors of the parameters.
-        own = np.ix_(parameters, parameters)
-        H[own] -= prior.parameter_information
-        moved = prior.parameter_offset + found.state.moved[parameters]
-        b[parameters] += prior.parameter_information @ moved
-        _to_perturbations(H, b, parameters, by_now)
-        _to_perturbations(H_motion, b_motion, parameters, by_now)
-    motion, motion_gradient, *_ = _marginal(H_motion, b_motion, of_motion)
-    del H_motion
+    motion, motion_gradient = prior.marginal_at(found.state.moved, kept)
     # How the vehicle stands is kept at first: others test what is assumed of it.
     stand = np.arange(layout.standing, layout.standing + STANDING)
     tilt = mean_tilt(found)
-    of_tilt = np.zeros((0, len(H))) if tilt is None else tilt.rows.copy()
-    of_tilt[:, parameters] = of_tilt[:, parameters] @ by_now
-    both, both_gradient, rows, cov = _marginal(H, b, np.concatenate([keep, stand]), of_tilt)
+    of_tilt = np.zeros((0, len(system.H))) if tilt is None else tilt.rows
+    both, both_gradient, rows, cov = _marginal(
+        system.H, system.b, np.concatenate([keep, stand]), of_tilt
+    )
+    own = np.arange(len(poses), len(of_motion))
+    _to_perturbations(motion, motion_gradient, own, by_now)
+    # The graph of the calibration has the priors of the parameters.
+    both[np.ix_(own, own)] -= prior.parameter_information
+    moved = prior.parameter_offset + found.state.moved[parameters]
+    both_gradient[own] += prior.parameter_information @ moved
+    _to_perturbations(both, both_gradient, own, by_now)
+    rows[:, own] = rows[:, own] @ by_now
     if tilt is not None:
         tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
     now = found.state.errors[stand]

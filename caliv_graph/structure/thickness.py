@@ -19,20 +19,28 @@ RIDGE = 1e-6
 """Prior of a fitted plane, in sightings: what one LiDAR sees from afar determines no tilt."""
 
 
+TOGETHER = 4096
+"""Sightings whose derivatives are computed at a time: temporary memory is small."""
+
+
+def plane_rows(geometry: Geometry, sightings: Sightings) -> Array:
+    """(Q, 3) derivatives of the distances of the sightings' middles by their planes."""
+    middles = np.concatenate([sightings.centroids_lidar, np.ones((sightings.count, 1))], axis=1)
+    return np.asarray(np.einsum("qci,qi->qc", geometry.by[:, PLANE_ROWS], middles))
+
+
 def thickness_m(
-    geometry: Geometry, sightings: Sightings, weights: Array, offsets_m: Array, count: int
+    rows: Array, sightings: Sightings, weights: Array, offsets_m: Array, count: int
 ) -> Array:
     """(K, ...) root mean square distance of the sightings of each strip from a plane through them.
 
     Args:
-        geometry: its derivatives by the plane are used.
+        rows: (Q, 3) `plane_rows`.
         sightings: Q of them.
         weights: (Q,) robust.
-        offsets_m: (Q, ...) their distances from the plane at which `geometry` was computed.
+        offsets_m: (Q, ...) their distances from the plane at which `rows` were computed.
         count: K; a strip without weight is NaN.
     """
-    middles = np.concatenate([sightings.centroids_lidar, np.ones((sightings.count, 1))], axis=1)
-    rows = np.einsum("qci,qi->qc", geometry.by[:, PLANE_ROWS], middles)
     # Nothing may be seen at the guesses: -1 would not tell how many there are.
     r = offsets_m.reshape(sightings.count, math.prod(offsets_m.shape[1:]))
     squares = np.full((count, r.shape[1]), np.nan)
@@ -83,12 +91,17 @@ def thickness_at_guesses(found: Solved) -> Array:
     placed = placed_patches(problem, state)
     seen = placed_sightings(problem, placed, found.strips, sigma)
     sightings, weights = weighted_alike(seen, found.sightings, found.weights)
-    geometry = geometry_at(problem, state, sightings, found.layout)
-    offsets = geometry.offsets_m(sightings)
-    return thickness_m(geometry, sightings, weights, offsets, found.strips.count)
+    rows, offsets = np.zeros((sightings.count, 3)), np.zeros(sightings.count)
+    for begin in range(0, sightings.count, TOGETHER):
+        own = np.arange(begin, min(begin + TOGETHER, sightings.count))
+        some = sightings.only(own)
+        geometry = geometry_at(problem, state, some, found.layout)
+        rows[own], offsets[own] = plane_rows(geometry, some), geometry.offsets_m(some)
+    return thickness_m(rows, sightings, weights, offsets, found.strips.count)
 
 
 def thickness_at_estimate(found: Solved) -> Array:
     """(K,) of the strips of a solve."""
-    offsets = found.geometry.offsets_m(found.sightings)
-    return thickness_m(found.geometry, found.sightings, found.weights, offsets, found.strips.count)
+    geometry, sightings = found.geometry, found.sightings
+    rows, offsets = plane_rows(geometry, sightings), geometry.offsets_m(sightings)
+    return thickness_m(rows, sightings, found.weights, offsets, found.strips.count)

@@ -47,3 +47,29 @@ def test_a_prior_is_linearised_where_its_poses_are() -> None:
         first[own, own] = block
     assert pytest.approx(first.T @ prior.information @ first) == H
     assert prior.at(np.zeros(21))[0] is prior.information
+
+
+def test_the_marginal_is_that_of_the_whole_prior_there() -> None:
+    rng = np.random.default_rng(3)
+    A = rng.standard_normal((24, 24))
+    size = 6 * POSES + 3
+    prior = PosePrior(
+        stamps_ns=np.arange(POSES),
+        T_map_vehicle=tuple(gtsam.Pose3.Expmap(v) for v in rng.standard_normal((POSES, 6))),
+        parameters={"gnss.lever_arm": np.zeros(3)},
+        information=(A @ A.T)[:size, :size],
+        gradient=rng.standard_normal(size),
+        parameter_information=np.eye(3),
+        parameter_offset=np.zeros(3),
+        chart=CHART,
+    )
+    moved = 0.3 * rng.standard_normal(size)
+    H, b = prior.at(moved)
+    for kept in ([2, 0], [1], [], [0, 1, 2]):
+        own = np.concatenate([*(6 * i + np.arange(6) for i in kept), 6 * POSES + np.arange(3)])
+        cov = np.linalg.inv(H)[np.ix_(own, own)]
+
+        information, gradient = prior.marginal_at(moved, np.array(kept, dtype=np.int64))
+
+        assert np.linalg.inv(information) == pytest.approx(cov)
+        assert cov @ gradient == pytest.approx(np.linalg.solve(H, b)[own])

@@ -10,6 +10,7 @@ import pytest
 
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, StructureTerm
+from caliv_graph.structure import thickness
 from caliv_graph.structure.noise import ONE_VIEW_M, range_sigmas
 from caliv_graph.structure.problem import Problem, part_of
 from caliv_graph.structure.solve import Solved, solve_structure
@@ -252,6 +253,14 @@ def test_nothing_to_see_is_said() -> None:
     problem = problem_of(PARALLEL, _straight(24), 3)
     few = part_of(problem, np.arange(len(problem.patches.scan)) < 5)
     assert solve_structure(few, dict(TRUE)) is None
+
+
+def test_thickness_does_not_depend_on_how_many_sightings_are_taken_at_a_time(
+    solved: Solved, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = thickness_at_guesses(solved)
+    monkeypatch.setattr(thickness, "TOGETHER", 7)
+    assert thickness_at_guesses(solved) == pytest.approx(together, nan_ok=True)
 
 
 def test_strips_that_are_not_there_at_the_guesses_have_no_thickness_before(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 
 # Parameters of glibc's mallopt (malloc.h).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
@@ -19,8 +20,11 @@ MOST_KEPT = 512 * 2**20
 def give_back_freed_memory() -> None:
     """Gives memory that is freed back to the system, in front of a stage that takes much.
 
-    What many small objects leave behind is in pieces that no large array fits into.
+    What many small objects leave behind is in pieces that no large array fits into. Python keeps
+    some thousand small objects of each kind for later; spread over what a long drive took, they
+    keep all of it. A full collection lets go of them.
     """
+    gc.collect()
     try:
         ctypes.CDLL(None).malloc_trim(0)
     except (AttributeError, OSError, TypeError):

@@ -10,6 +10,7 @@ from functools import cached_property, partial
 import gtsam
 import numpy as np
 
+from caliv_graph.common.memory import give_back_freed_memory
 from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.beams import KINDS
@@ -268,7 +269,9 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks]:
     state = replace(found.state, errors=errors)
     geometry = geometry_at(problem, state, found.sightings, layout)
     jittering = replace(found, state=state, layout=layout, geometry=geometry)
+    give_back_freed_memory()
     system = jittering.linearised()
+    give_back_freed_memory()
     # The hold in place, and out again: a copy would be as large as the system.
     held = slice(layout.offset, layout.error)
     without = system.H[held, held].copy(), system.b[held].copy()
@@ -304,6 +307,7 @@ def _on_all_poses(
     layout = replace(found.layout, poses=len(problem.prior.stamps_ns))
     geometry = geometry_at(problem, state, found.sightings, layout, dents=False)
     found = replace(found, problem=problem, state=state, layout=layout, geometry=geometry)
+    give_back_freed_memory()
     return Solved(**vars(found), system=replace(found.linearised(), b=b))
 
 

@@ -44,7 +44,7 @@ def errors_of(before: list[gtsam.Pose3], after: list[gtsam.Pose3]) -> Array:
     total = np.sqrt(STAMPS[-1] * 1e-9)
     held = np.hstack([np.zeros((3, 6)), LEAST_TURNING_RAD_S * total * np.eye(3)])
     A = np.vstack([*rows, held])
-    return np.linalg.lstsq(A, np.concatenate([*changes, np.zeros(3)]), rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(A, np.concatenate([*changes, np.zeros(3)]), rcond=None)[0])
 
 
 def test_rows_are_derivatives_of_what_fits_the_rates() -> None:

@@ -315,7 +315,7 @@ def _measured(
     geometry = geometry_at(problem, here, sightings, layout)
     group = groups_of(sightings, strips)
     repeated = problem.views.count[sightings.scan]
-    same, half_m = alike(problem, sightings), strips.half_widths_m[sightings.strip]
+    same, half_m = alike(problem, sightings), 0.5 * strips.edge_m[sightings.strip]
     rows = whitened(
         geometry, sightings, group, repeated, same, half_m, other.nuisances, weights, layout.size
     )

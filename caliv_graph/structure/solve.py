@@ -94,7 +94,7 @@ class Estimate:
                 group,
                 repeated,
                 alike(problem, sightings),
-                self.strips.half_widths_m[sightings.strip],
+                0.5 * self.strips.edge_m[sightings.strip],
                 self.nuisances,
                 self.weights,
                 self.layout.size,

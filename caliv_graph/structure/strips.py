@@ -19,6 +19,10 @@ GROUND_CELL_M = 0.7
 """The same of level ground, the only surface that is seen in rings, each LiDAR's elsewhere: crown,
 waves and bumps between these pass for a height of the LiDARs. Patches are half a metre wide."""
 
+ENOUGH_PATCHES = 12
+"""Fewest patches of such a cell, two for each scan that a strip needs; where there are fewer, on
+the way of a fast vehicle or far off, the cells of the ground are as large as those of walls."""
+
 WIDE_ANGLE_RAD = math.radians(25.0)
 WIDE_GATE_M = 0.3
 NARROW_ANGLE_RAD = math.radians(6.0)
@@ -56,22 +60,19 @@ class Strips:
         normals_map: (K, 3) unit vectors, towards the side that was seen.
         surface: (K,) number of the surface that each is a part of.
         of_patch: (N,) strip of each patch; -1: none.
+        edge_m: (K,) of the cell of each.
     """
 
     centres_map: Array
     normals_map: Array
     surface: IntArray
     of_patch: IntArray
+    edge_m: Array
 
     @property
     def count(self) -> int:
         """K."""
         return len(self.centres_map)
-
-    @property
-    def half_widths_m(self) -> Array:
-        """(K,) half the edge of the cell of each."""
-        return np.where(self.level, 0.5 * GROUND_CELL_M, 0.5 * CELL_M)
 
     @property
     def level(self) -> BoolArray:
@@ -92,7 +93,7 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
     """
     of_patch = np.full(len(scan), -1, dtype=np.int64)
     positions = moments_map[:, :3, 3] / moments_map[:, 3, 3, None]
-    left, cell = _cells(positions, normals_map)
+    left, cell, edge_m = _cells(positions, normals_map)
     cells: list[IntArray] = []
     found: list[_Found] = []
     for _ in range(STRIPS_OF_A_CELL):
@@ -107,36 +108,52 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
         left, cell = left[~one.gone], cell[~one.gone]
     of_cell = np.concatenate([np.zeros(0, np.int64), *cells])
     if not len(of_cell):
-        return Strips(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64), of_patch)
+        none = np.zeros((0, 3))
+        return Strips(none, none, np.zeros(0, np.int64), of_patch, np.zeros(0))
     order = np.argsort(of_cell, kind="stable")
     seen = of_patch >= 0
     of_patch[seen] = np.argsort(order)[of_patch[seen]]
     centres = np.concatenate([one.centres_map for one in found])[order]
     normals = np.concatenate([one.normals_map for one in found])[order]
-    return Strips(centres, normals, _surfaces(centres, normals), of_patch)
+    edges = np.zeros(len(centres))
+    edges[of_patch[seen]] = edge_m[seen]
+    return Strips(centres, normals, _surfaces(centres, normals), of_patch, edges)
 
 
-def _cells(positions: Array, normals: Array) -> tuple[IntArray, IntArray]:
+def _cells(positions: Array, normals: Array) -> tuple[IntArray, IntArray, Array]:
     """Indices (N,) of the patches column by column of the map, and the columns' numbers (N,).
+
+    And the edge of each patch's cell (N,), metres.
 
     Patches whose normals are nearest to the same axis of the map and point the same way share a
     column along it. A surface must not be cut where it lies: ground at the height of a boundary
     would be two strips, of patches whose errors have the same sign.
     """
+    edge = np.full(len(positions), CELL_M)
     if not len(positions):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), edge
     axis = np.abs(normals).argmax(axis=1)
     each = np.arange(len(axis))
-    edge = np.where(normals[:, 2] > LEVEL, GROUND_CELL_M, CELL_M)
+    side = np.where(normals[each, axis] > 0.0, axis, -1 - axis)
+    level = np.flatnonzero(normals[:, 2] > LEVEL)
+    fine = np.floor(positions[level, :2] / GROUND_CELL_M).astype(np.int64)
+    number = _numbers(*fine.T)
+    _, own, count = np.unique(number, return_inverse=True, return_counts=True)
+    edge[level[count[own.ravel()] >= ENOUGH_PATCHES]] = GROUND_CELL_M
     cell = np.floor(positions / edge[:, None]).astype(np.int64)
     cell[each, axis] = 0
-    side = np.where(normals[each, axis] > 0.0, axis, -1 - axis)
-    key = np.zeros(len(axis), dtype=np.int64)
-    for part in ((edge > GROUND_CELL_M).astype(np.int64), side, *cell.T):
-        # In the order of the five numbers: one sort of integers.
-        key = key * (np.ptp(part) + 1) + part - part.min()
+    key = _numbers((edge < CELL_M).astype(np.int64), side, *cell.T)
     order = np.argsort(key, kind="stable")
-    return order, np.cumsum(np.diff(key[order], prepend=-1) > 0) - 1
+    return order, np.cumsum(np.diff(key[order], prepend=-1) > 0) - 1, edge
+
+
+def _numbers(*parts: IntArray) -> IntArray:
+    """(N,) one number for each tuple of integers, in their order: one sort of integers."""
+    key = np.zeros(len(parts[0]), dtype=np.int64)
+    for part in parts:
+        if len(part):
+            key = key * (np.ptp(part) + 1) + part - part.min()
+    return key
 
 
 @dataclass(frozen=True)

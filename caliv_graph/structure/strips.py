@@ -17,11 +17,8 @@ CELL_M = 2.0
 
 GROUND_CELL_M = 0.7
 """The same of level ground, the only surface that is seen in rings, each LiDAR's elsewhere: crown,
-waves and bumps between these pass for a height of the LiDARs. Patches are half a metre wide."""
-
-ENOUGH_PATCHES = 12
-"""Fewest patches of such a cell, two for each scan that a strip needs; where there are fewer, on
-the way of a fast vehicle or far off, the cells of the ground are as large as those of walls."""
+waves and bumps between these pass for a height of the LiDARs. Patches are half a metre wide. Where
+too few scans see most of the ground for strips of that size, its cells are those of walls."""
 
 WIDE_ANGLE_RAD = math.radians(25.0)
 WIDE_GATE_M = 0.3
@@ -93,7 +90,7 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
     """
     of_patch = np.full(len(scan), -1, dtype=np.int64)
     positions = moments_map[:, :3, 3] / moments_map[:, 3, 3, None]
-    left, cell, edge_m = _cells(positions, normals_map)
+    left, cell, edge_m = _cells(positions, normals_map, scan)
     cells: list[IntArray] = []
     found: list[_Found] = []
     for _ in range(STRIPS_OF_A_CELL):
@@ -120,7 +117,7 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
     return Strips(centres, normals, _surfaces(centres, normals), of_patch, edges)
 
 
-def _cells(positions: Array, normals: Array) -> tuple[IntArray, IntArray, Array]:
+def _cells(positions: Array, normals: Array, scan: IntArray) -> tuple[IntArray, IntArray, Array]:
     """Indices (N,) of the patches column by column of the map, and the columns' numbers (N,).
 
     And the edge of each patch's cell (N,), metres.
@@ -137,9 +134,11 @@ def _cells(positions: Array, normals: Array) -> tuple[IntArray, IntArray, Array]
     side = np.where(normals[each, axis] > 0.0, axis, -1 - axis)
     level = np.flatnonzero(normals[:, 2] > LEVEL)
     fine = np.floor(positions[level, :2] / GROUND_CELL_M).astype(np.int64)
-    number = _numbers(*fine.T)
-    _, own, count = np.unique(number, return_inverse=True, return_counts=True)
-    edge[level[count[own.ravel()] >= ENOUGH_PATCHES]] = GROUND_CELL_M
+    _, own = np.unique(_numbers(*fine.T), return_inverse=True)
+    by_scan = np.unique(_numbers(own.ravel(), scan[level]), return_index=True)[1]
+    scans = np.bincount(own.ravel()[by_scan], minlength=1)
+    if len(level) and np.mean(scans[own.ravel()] >= MIN_SCANS) > 0.5:
+        edge[level] = GROUND_CELL_M
     cell = np.floor(positions / edge[:, None]).astype(np.int64)
     cell[each, axis] = 0
     key = _numbers((edge < CELL_M).astype(np.int64), side, *cell.T)

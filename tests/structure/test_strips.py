@@ -75,13 +75,14 @@ def test_fronts_behind_each_other_are_strips_of_their_own() -> None:
     assert sorted(strips.centres_map[:, 0].round(2).tolist()) == [1.0, 3.0, 3.5, 9.0]
 
 
-@pytest.mark.parametrize(("each", "edge_m"), [(1, 2.0), (3, 0.7)])
+@pytest.mark.parametrize(("each", "edge_m"), [(1, 2.0), (8, 0.7)])
 def test_ground_that_few_scans_see_is_a_wider_strip(each: int, edge_m: float) -> None:
-    """Eight scans along 1.6 m: four patches in a cell of 0.7 m are no strip, twelve are."""
+    """Eight scans along 1.2 m: four in each cell of 0.7 m, or all in both."""
     along = np.repeat(np.linspace(0.1, 1.3, 8), each)
+    scan = np.tile(EIGHT, each) if each > 1 else EIGHT
     ground = np.column_stack([along, np.full(8 * each, 1.0), np.zeros(8 * each)])
     up = np.tile([0.0, 0.0, 1.0], (8 * each, 1))
-    strips = find_strips(*patches(ground, up), np.tile(EIGHT, each), 0.1)
+    strips = find_strips(*patches(ground, up), scan, 0.1)
     assert set(strips.edge_m) == {edge_m}
     assert (strips.of_patch >= 0).all()
 

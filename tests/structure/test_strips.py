@@ -1,7 +1,6 @@
 """Strips: what is taken for one piece of surface."""
 
 import numpy as np
-import pytest
 
 from caliv_graph.structure.strips import MIN_SCANS, find_strips
 
@@ -73,18 +72,6 @@ def test_fronts_behind_each_other_are_strips_of_their_own() -> None:
         *patches(centres, np.tile([1.0, 0.0, 0.0], (32, 1))), np.tile(EIGHT, 4), 0.06
     )
     assert sorted(strips.centres_map[:, 0].round(2).tolist()) == [1.0, 3.0, 3.5, 9.0]
-
-
-@pytest.mark.parametrize(("each", "edge_m"), [(1, 2.0), (8, 0.7)])
-def test_ground_that_few_scans_see_is_a_wider_strip(each: int, edge_m: float) -> None:
-    """Eight scans along 1.2 m: four in each cell of 0.7 m, or all in both."""
-    along = np.repeat(np.linspace(0.1, 1.3, 8), each)
-    scan = np.tile(EIGHT, each) if each > 1 else EIGHT
-    ground = np.column_stack([along, np.full(8 * each, 1.0), np.zeros(8 * each)])
-    up = np.tile([0.0, 0.0, 1.0], (8 * each, 1))
-    strips = find_strips(*patches(ground, up), scan, 0.1)
-    assert set(strips.edge_m) == {edge_m}
-    assert (strips.of_patch >= 0).all()
 
 
 def test_what_few_scans_see_is_no_strip() -> None:

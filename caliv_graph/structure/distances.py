@@ -315,9 +315,9 @@ def _measured(
     geometry = geometry_at(problem, here, sightings, layout)
     group = groups_of(sightings, strips)
     repeated = problem.views.count[sightings.scan]
-    same, half_m = alike(problem, sightings), 0.5 * strips.edge_m[sightings.strip]
+    same = alike(problem, sightings)
     rows = whitened(
-        geometry, sightings, group, repeated, same, half_m, other.nuisances, weights, layout.size
+        geometry, sightings, group, repeated, same, other.nuisances, weights, layout.size
     )
     found = _Distances(other, rows)
     offsets, by_plane = geometry.offsets_m(sightings), plane_rows(geometry, sightings)

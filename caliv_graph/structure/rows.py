@@ -68,7 +68,6 @@ def whitened(
     group: IntArray,
     repeated: IntArray,
     alike: IntArray,
-    half_m: Array,
     nuisances: Nuisances,
     weights: Array,
     size: int,
@@ -77,17 +76,14 @@ def whitened(
 
     `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
     view: what these share counts as often, so that their mean has the error of one. `alike` (Q,)
-    says how many sightings of its strip its LiDAR has, `half_m` (Q,) is half the width of that
-    strip: over it the error of a sighting changes by its own sigma, as how beams fall on joints,
-    edges and bumps differs over a strip as much as from scan to scan. `weights` (Q,) are robust,
-    `size` is D.
+    says how many sightings of its strip its LiDAR has. `weights` (Q,) are robust, `size` is D.
     """
     more = repetition(nuisances, repeated)
     own = nuisances.sighting[sightings.strip] * more
     # A strip that two LiDARs see apart they see tilted against each other, too, and alike in all
     # scans: bumps within it. As often as it is seen, so often the error counts.
     tilt = np.sqrt(own**2 + (alike - 1.0) * nuisances.strip[sightings.strip] ** 2)
-    S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt / half_m)
+    S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]
     values, vectors = np.linalg.eigh(S)
     C = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]

@@ -20,6 +20,11 @@ ROUGHNESS_M = 0.003
 BEAM_RAD = 3e-4
 """1 sigma of the direction of a beam: a tenth of the usual divergence of 3 mrad."""
 
+TILT_LENGTH_M = 1.0
+"""Distance over which the error of a sighting changes by its own sigma: half a strip. How beams
+fall on joints, edges and bumps differs over a strip as much as from scan to scan."""
+
+
 MIN_COS = GRAZING_COS
 """Smallest cosine of the incidence: beyond, footprints are metres long."""
 
@@ -165,19 +170,21 @@ def sightings_of(
 
 
 def without_own_error(
-    sightings: Sightings, normals_lidar: Array, offset_m: Array, tilt_rad: Array
+    sightings: Sightings, normals_lidar: Array, offset_m: Array, tilt_m: Array
 ) -> tuple[Array, Array]:
     """Moments (Q, 4, 4) without the own error of each sighting; and what noise adds.
 
     That error is an offset and two tilts: `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`. However many
     points it has, a sighting knows its strip no better than `offset_m` (Q,) at its middle, and its
-    tilt no better than `tilt_rad` (Q,). `normals_lidar` (Q, 3) at the scan's stamp.
+    tilt no better than `tilt_m` (Q,) over `TILT_LENGTH_M`. `normals_lidar` (Q, 3) at the scan's
+    stamp.
     """
     S = sightings.moments
     N = along_surface(S, normals_lidar)
+    N[:, :, 1:] /= TILT_LENGTH_M
     SN = S @ N
     inner = np.swapaxes(N, 1, 2) @ SN
-    inner[:, range(3), range(3)] += np.stack([offset_m, tilt_rad, tilt_rad], axis=1) ** -2.0
+    inner[:, range(3), range(3)] += np.stack([offset_m, tilt_m, tilt_m], axis=1) ** -2.0
     K = N @ np.linalg.solve(inner, np.swapaxes(SN, 1, 2))
     left = np.eye(4) - K
     out = S @ left

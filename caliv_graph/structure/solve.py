@@ -94,7 +94,6 @@ class Estimate:
                 group,
                 repeated,
                 alike(problem, sightings),
-                0.5 * self.strips.edge_m[sightings.strip],
                 self.nuisances,
                 self.weights,
                 self.layout.size,

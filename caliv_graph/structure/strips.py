@@ -13,12 +13,10 @@ from scipy.spatial import cKDTree
 from caliv_graph.products import Array, BoolArray, IntArray
 
 CELL_M = 2.0
-"""Edge of the cells of the map that strips are found in: walls are not flat beyond 2 m."""
-
-GROUND_CELL_M = CELL_M
-"""The same of level ground. It is seen in rings, each LiDAR's elsewhere: cells of 0.7 m follow the
-crown of a road better (NEES of S2S 14 in place of 65 in `street` of the second simulator), but a
-LiDAR that sees little ground lost hold of it (random drive 633: z 87 mm off, exit 4)."""
+"""Edge of the cells of the map that strips are found in: walls are not flat beyond 2 m. On the
+ground 0.7 m follow the crown of a road better (NEES of S2S 14 in place of 65 in `street` of the
+second simulator), but a LiDAR that sees little ground lost hold of it (random drive 633: z 87 mm
+off, exit 4)."""
 
 WIDE_ANGLE_RAD = math.radians(25.0)
 WIDE_GATE_M = 0.3
@@ -57,14 +55,12 @@ class Strips:
         normals_map: (K, 3) unit vectors, towards the side that was seen.
         surface: (K,) number of the surface that each is a part of.
         of_patch: (N,) strip of each patch; -1: none.
-        edge_m: (K,) of the cell of each.
     """
 
     centres_map: Array
     normals_map: Array
     surface: IntArray
     of_patch: IntArray
-    edge_m: Array
 
     @property
     def count(self) -> int:
@@ -90,7 +86,7 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
     """
     of_patch = np.full(len(scan), -1, dtype=np.int64)
     positions = moments_map[:, :3, 3] / moments_map[:, 3, 3, None]
-    left, cell, edge_m = _cells(positions, normals_map, scan)
+    left, cell = _cells(positions, normals_map)
     cells: list[IntArray] = []
     found: list[_Found] = []
     for _ in range(STRIPS_OF_A_CELL):
@@ -105,54 +101,35 @@ def find_strips(moments_map: Array, normals_map: Array, scan: IntArray, gate_m: 
         left, cell = left[~one.gone], cell[~one.gone]
     of_cell = np.concatenate([np.zeros(0, np.int64), *cells])
     if not len(of_cell):
-        none = np.zeros((0, 3))
-        return Strips(none, none, np.zeros(0, np.int64), of_patch, np.zeros(0))
+        return Strips(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64), of_patch)
     order = np.argsort(of_cell, kind="stable")
     seen = of_patch >= 0
     of_patch[seen] = np.argsort(order)[of_patch[seen]]
     centres = np.concatenate([one.centres_map for one in found])[order]
     normals = np.concatenate([one.normals_map for one in found])[order]
-    edges = np.zeros(len(centres))
-    edges[of_patch[seen]] = edge_m[seen]
-    return Strips(centres, normals, _surfaces(centres, normals), of_patch, edges)
+    return Strips(centres, normals, _surfaces(centres, normals), of_patch)
 
 
-def _cells(positions: Array, normals: Array, scan: IntArray) -> tuple[IntArray, IntArray, Array]:
+def _cells(positions: Array, normals: Array) -> tuple[IntArray, IntArray]:
     """Indices (N,) of the patches column by column of the map, and the columns' numbers (N,).
-
-    And the edge of each patch's cell (N,), metres.
 
     Patches whose normals are nearest to the same axis of the map and point the same way share a
     column along it. A surface must not be cut where it lies: ground at the height of a boundary
     would be two strips, of patches whose errors have the same sign.
     """
-    edge = np.full(len(positions), CELL_M)
     if not len(positions):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), edge
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     axis = np.abs(normals).argmax(axis=1)
     each = np.arange(len(axis))
-    side = np.where(normals[each, axis] > 0.0, axis, -1 - axis)
-    level = np.flatnonzero(normals[:, 2] > LEVEL)
-    fine = np.floor(positions[level, :2] / GROUND_CELL_M).astype(np.int64)
-    _, own = np.unique(_numbers(*fine.T), return_inverse=True)
-    by_scan = np.unique(_numbers(own.ravel(), scan[level]), return_index=True)[1]
-    scans = np.bincount(own.ravel()[by_scan], minlength=1)
-    if len(level) and np.mean(scans[own.ravel()] >= MIN_SCANS) > 0.5:
-        edge[level] = GROUND_CELL_M
-    cell = np.floor(positions / edge[:, None]).astype(np.int64)
+    cell = np.floor(positions / CELL_M).astype(np.int64)
     cell[each, axis] = 0
-    key = _numbers((edge < CELL_M).astype(np.int64), side, *cell.T)
+    side = np.where(normals[each, axis] > 0.0, axis, -1 - axis)
+    key = np.zeros(len(axis), dtype=np.int64)
+    for part in (side, *cell.T):
+        # In the order of the four numbers: one sort of integers.
+        key = key * (np.ptp(part) + 1) + part - part.min()
     order = np.argsort(key, kind="stable")
-    return order, np.cumsum(np.diff(key[order], prepend=-1) > 0) - 1, edge
-
-
-def _numbers(*parts: IntArray) -> IntArray:
-    """(N,) one number for each tuple of integers, in their order: one sort of integers."""
-    key = np.zeros(len(parts[0]), dtype=np.int64)
-    for part in parts:
-        if len(part):
-            key = key * (np.ptp(part) + 1) + part - part.min()
-    return key
+    return order, np.cumsum(np.diff(key[order], prepend=-1) > 0) - 1
 
 
 @dataclass(frozen=True)

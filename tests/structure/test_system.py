@@ -303,7 +303,6 @@ def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them()
             np.arange(count),
             own,
             count * own,
-            np.ones(count),
             nuisances,
             np.ones(count),
             layout.size,

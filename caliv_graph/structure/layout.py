@@ -10,7 +10,7 @@ import numpy as np
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.beams import KINDS
+from caliv_graph.structure.beams import BeamErrors
 from caliv_graph.structure.bends import BENDS
 from caliv_graph.trajectory.imu import exp_so3
 
@@ -34,8 +34,8 @@ class Nuisances:
             the beams fall, change along a wall slowly.
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
             from one place, beyond what `strip` has of it.
-        beams: (N, KINDS) of the beams of the LiDARs at each of N elevations (`beams.KINDS`): m,
-            rad, rad, m/rad, rad/rad.
+        beams: (E,) of the errors of the beams of all LiDARs, as in `Layout.beams`: m, rad, rad,
+            m/rad, rad/rad, by their kinds.
         jitter_s: of the stamp of each scan, s; 0: no such variables.
         turn_rad_s: (P, 3) of the angular velocity within scans (`Problem.turn_rad_s`); not metres.
     """
@@ -48,7 +48,7 @@ class Nuisances:
     sighting: Array
     shared: float
     repeated: float
-    beams: Array = field(default_factory=lambda: np.zeros((0, KINDS)))
+    beams: Array = field(default_factory=lambda: np.zeros(0))
     bend: Array = field(default_factory=lambda: np.zeros(0))
     jitter_s: float = 0.0
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -88,12 +88,12 @@ class Layout:
 
     In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
     were moved (`rates`, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth
-    with incidence, and that on the ground (3), errors of its beams at some elevations (`KINDS`,
-    if there are any), error of the vehicle's height and tilt above the ground (3), errors of the
-    angular velocity within the scans at each pose, if there are any (3), jitter of the stamp of
-    each scan, if there is any; and what belongs to one surface each: planes (two tilts, offset),
-    bends of each strip, if they are bent (`BENDS` times K), bias of each LiDAR on each surface,
-    offset of each LiDAR on each strip.
+    with incidence, and that on the ground (3), errors of the beams of each LiDAR, if they err
+    (kind by kind, of each all nodes), error of the vehicle's height and tilt above the ground (3),
+    errors of the angular velocity within the scans at each pose, if there are any (3), jitter of
+    the stamp of each scan, if there is any; and what belongs to one surface each: planes (two
+    tilts, offset), bends of each strip, if they are bent (`BENDS` times K), bias of each LiDAR on
+    each surface, offset of each LiDAR on each strip.
     """
 
     poses: int
@@ -104,7 +104,7 @@ class Layout:
     jitters: int = 0
     rates: int = 0
     turns: int = 0
-    beams: tuple[int, ...] = ()
+    beams: tuple[BeamErrors, ...] = ()
     bent: bool = False
 
     @property
@@ -155,7 +155,7 @@ class Layout:
     @property
     def standing(self) -> int:
         """Error of the vehicle's height above ground, and the two of its tilt."""
-        return self.beam + KINDS * sum(self.beams)
+        return self.beam + sum(errors.size for errors in self.beams)
 
     @property
     def beam(self) -> int:
@@ -194,7 +194,7 @@ class Layout:
         return np.concatenate(
             [
                 np.tile(of_lidar, self.lidars),
-                nuisances.beams.ravel(),
+                nuisances.beams,
                 np.tile(nuisances.bend, BENDS * self.bent),
                 np.full(self.lidars * self.surfaces, nuisances.surface),
                 np.tile(nuisances.strip, self.lidars),

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.linalg
 from scipy.optimize import nnls
 
-from caliv_graph.config.range_errors import RangeErrors, log_normal, size_weights
+from caliv_graph.config.range_errors import RangeErrors, SizePrior, log_normal, size_weights
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.structure.beams import KINDS, mean_weight
+from caliv_graph.structure.beams import MEANS, BeamErrors, mean_rows, parts_of
 from caliv_graph.structure.bends import BENDS, USUAL_PER_M
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
-from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.patches import DrivePatches, along_surface
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.views import Views
@@ -62,6 +63,9 @@ BEAM_SIZES = np.geomspace(0.1, 30.0, 15)
 """Sizes of the errors of the beams in the integral, in usual ones: up to 3 cm and 1.5 mrad, unless
 less is stated of the ranges."""
 
+BEAM_ROUNDS = 10
+"""Rounds in which their sizes are estimated: errors, and which of them are large."""
+
 MOST_STRIP_M = 0.05
 """Its largest sigma: what is seen farther apart is no one strip."""
 
@@ -69,7 +73,11 @@ LEAST_BEND_PER_M, MOST_BEND_PER_M = 2e-4, 0.1
 """Smallest and largest sigma of a bend: 0.1 mm and 5 cm in the middle of 2 m."""
 
 SPREADS = (3.0, 6.0)
-"""Offset of a sighting in sigmas up to which it has full weight, and from which it has none."""
+"""Offset of a sighting in sigmas up to which it has full weight, and from which it has none; and
+its tilt, of ground."""
+
+STEEPEST_RAD = 1.0
+"""Prior of the tilt of a sighting: points on a line do not tell it."""
 
 
 LEAST_JITTER_S = 1e-5
@@ -134,9 +142,41 @@ def _variance_parts(cos: Array, distance_m: Array, variance: Array) -> Array:
 def robust_weights(offsets_m: Array, sightings: Sightings, nuisances: Nuisances) -> Array:
     """(Q,) weights by the offset of each sighting: full, falling to none between `SPREADS`."""
     variance = _variances(sightings, nuisances.sighting[sightings.strip]) + nuisances.shared**2
-    t = np.abs(offsets_m) / np.sqrt(variance)
+    return _falling(np.abs(offsets_m) / np.sqrt(variance))
+
+
+def tilt_weights(geometry: Geometry, sightings: Sightings, level: BoolArray) -> Array:
+    """(Q,) weights by the tilt of each sighting of ground, likewise, in units of what is common.
+
+    Three rings over a kerb lie on a plane, and its middle may well be on the road's. Walls have all
+    of theirs: where a vehicle's heading errs, or its clock, they are tilted against each other, and
+    this is how it shows. `level` (K,) are the strips that are ground.
+    """
+    out = np.ones(sightings.count)
+    own = level[sightings.strip]
+    if not own.any():
+        return out
+    tilts, variances = _tilts(
+        sightings.moments[own], geometry.plain[own], geometry.normals_lidar[own]
+    )
+    common = _common_sigma(tilts.ravel(), variances.ravel(), 1.0)
+    out[own] = _falling((np.abs(tilts) / np.sqrt(variances + common**2)).max(axis=1, initial=0.0))
+    return out
+
+
+def _falling(t: Array) -> Array:
+    """(Q,) weights by numbers of sigmas (Q,)."""
     low, high = SPREADS
     return np.clip((high - t) / (high - low), 0.0, 1.0)
+
+
+def _tilts(moments: Array, plain: Array, normals_lidar: Array) -> tuple[Array, Array]:
+    """Tilts (Q, 2) of the points of each sighting to their plane, rad; variances by their noise."""
+    N = along_surface(moments, normals_lidar)
+    of_points = np.swapaxes(N, 1, 2) @ moments
+    cov = np.linalg.inv(of_points @ N + np.diag([0.0, STEEPEST_RAD**-2.0, STEEPEST_RAD**-2.0]))
+    fitted = np.einsum("qij,qjk,qk->qi", cov, of_points, plain)
+    return fitted[:, 1:], np.diagonal(cov, axis1=1, axis2=2)[:, 1:]
 
 
 def _variances(sightings: Sightings, sigma_m: Array) -> Array:
@@ -319,43 +359,74 @@ def _beam_sigmas(
     errors: Array,
     ranges: RangeErrors,
 ) -> Array:
-    """(N, KINDS) 1 sigma of the errors of the beams of the LiDARs at each of N elevations.
+    """(E,) 1 sigma of each error of the beams of the LiDARs: `beam_sigmas` of a system."""
+    if not len(before):
+        return before
+    own = np.arange(layout.beam, layout.standing)
+    known = np.linalg.inv(covariance(own))
+    J, _ = mean_rows(layout.beams, 0, errors[own])
+    mean = (J.T @ J).toarray()
+    data = known - np.diag(before**-2.0) - mean
+    return beam_sigmas(data, mean, known @ errors[own], before, layout.beams, ranges)
+
+
+def beam_sigmas(
+    data: Array,
+    mean: Array,
+    pull: Array,
+    before: Array,
+    beams: Sequence[BeamErrors],
+    ranges: RangeErrors,
+) -> Array:
+    """(E,) 1 sigma of each error of the beams of some LiDARs.
 
     For each LiDAR and kind the root mean square of the posterior of their common size, all else
     integrated out: errors of the elevations hide behind those of the ranges, and behind the pitch
     of the LiDAR, so that steps of their squares would end near zero. About it the errors have a t
-    distribution: leaves that one elevation sees are no error of all channels.
+    distribution: leaves that one elevation sees, or a kerb that one channel falls on in every scan,
+    are no error of all channels. Two that are large count as a large size of all at first, so that
+    it goes round.
+
+    Args:
+        data: (E, E) information on the errors, all else eliminated, without their priors.
+        mean: (E, E) that of `mean_rows`.
+        pull: (E,) of the data, at no errors.
+        before: (E,) the sigmas before.
+        beams: of each LiDAR.
+        ranges: what is stated of the ranges.
     """
-    if not len(before):
-        return before
-    own = np.arange(layout.beam, layout.standing)
-    joint = covariance(own)
-    found = errors[own].reshape(before.shape)
-    out = np.zeros_like(before)
-    begin = 0
-    for count in layout.beams:
-        part = np.arange(begin, begin := begin + count)
-        for kind, usual in enumerate(ranges.beams):
-            at = KINDS * part + kind
-            cov, error, sigma = joint[np.ix_(at, at)], found[part, kind], before[part, kind]
-            known = np.linalg.inv(cov)
-            # Without the priors; that the mean is zero says nothing of the size.
-            of_mean = np.full((count, count), mean_weight(count, kind) ** 2)
-            information = _positive(known - np.diag(sigma**-2.0) - of_mean)
-            middle = float(np.median(sigma))
-            shape = sigma / middle
-            prior = log_normal(usual * BEAM_SIZES, usual)
-            weights = size_weights(
-                shape[:, None] * information * shape,
-                shape * (known @ error),
-                np.zeros(count, dtype=np.int64),
-                [prior],
-            )
-            common = float(weights @ prior.sigmas**2)
-            share = np.clip(1.0 - np.diag(cov) / sigma**2, 0.0, 1.0)
-            variance = (STRIP_FREEDOM * common + error**2) / (STRIP_FREEDOM + share)
-            out[part, kind] = np.sqrt(np.minimum(variance, prior.sigmas[-1] ** 2))
-    return out
+    sigma = before.copy()
+    for _ in range(BEAM_ROUNDS):
+        joint = np.asarray(np.linalg.inv(data + mean + np.diag(sigma**-2.0)), dtype=np.float64)
+        found = joint @ pull
+        after = np.zeros_like(sigma)
+        for _, kind, at in parts_of(beams):
+            prior = log_normal(ranges.beams[kind] * BEAM_SIZES, ranges.beams[kind])
+            cov, error = joint[at, at], found[at]
+            common = _common_size(cov, error, sigma[at], prior, kind in MEANS)
+            share = np.clip(1.0 - np.diag(cov) / sigma[at] ** 2, 0.0, 1.0)
+            variance = (STRIP_FREEDOM * common**2 + error**2) / (STRIP_FREEDOM + share)
+            after[at] = np.sqrt(variance)
+        sigma = after
+    return sigma
+
+
+def _common_size(
+    cov: Array, error: Array, sigma: Array, prior: SizePrior, mean_held: bool
+) -> float:
+    """Root mean square of the posterior of the common size of some errors (n,).
+
+    They are estimated with a covariance (n, n) under their own sigmas (n,), whose ratios stay.
+    Where their mean is held at zero it says nothing of the size.
+    """
+    known = np.linalg.inv(cov)
+    shape = sigma / float(np.median(sigma))
+    free = scipy.linalg.null_space(shape[None]) if mean_held else np.eye(len(shape))
+    by = shape[:, None] * free
+    information = _positive(by.T @ (known - np.diag(sigma**-2.0)) @ by)
+    kinds = np.zeros(free.shape[1], dtype=np.int64)
+    weights = size_weights(information, by.T @ (known @ error), kinds, [prior])
+    return math.sqrt(float(weights @ prior.sigmas**2))
 
 
 def _positive(information: npt.NDArray[Any]) -> Array:

@@ -16,6 +16,8 @@ import numpy as np
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import skew, tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.channels import ChannelSums
+from caliv_graph.targets.cloud.beams import elevations
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,8 @@ class DrivePatches:
         scatter_m: (N,) standard deviation of the points along the normal, unbiased.
         swept: how points were moved to that time; None: all are taken at once.
         moved_with: of each LiDAR the T_vehicle_lidar that this was done with.
+        channels: what the points of each channel add; None: no LiDAR has channels. They are
+            multiplied by errors of millimetres, so that they follow no extrinsics.
     """
 
     drive: int
@@ -89,6 +93,7 @@ class DrivePatches:
     scatter_m: Array
     swept: Swept | None = None
     moved_with: tuple[gtsam.Pose3, ...] = ()
+    channels: ChannelSums | None = None
 
     def part(self, keep: BoolArray) -> DrivePatches:
         """Some of the patches (N,), of the same scans."""
@@ -100,6 +105,7 @@ class DrivePatches:
             normal_lidar=self.normal_lidar[keep],
             scatter_m=self.scatter_m[keep],
             swept=self.swept and self.swept.part(keep),
+            channels=self.channels and self.channels.part(keep, len(self.scan)),
         )
 
     def followed(self, T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> DrivePatches:
@@ -144,6 +150,11 @@ class DrivePatches:
     def centres_lidar(self) -> Array:
         """(N, 3) centroids, metres, lidar frame as of the patch's own time."""
         return self.moments[:, :3, 3] / self.moments[:, 3, 3, None]
+
+    @property
+    def elevations_rad(self) -> Array:
+        """(N,) of the centroids about the z axis of the LiDAR."""
+        return elevations(self.centres_lidar)
 
     @cached_property
     def scatter_along_beam_m(self) -> Array:

@@ -12,11 +12,15 @@ channels), is judged again together with its neighbours: first above and below, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.channels import (
+    ChannelSums,
+    PointChannels,
+)
 from caliv_graph.structure.patches import Swept
 
 PATCH_M = 0.5
@@ -62,6 +66,11 @@ MIN_SPREAD = 0.25
 """Pearson's kurtosis - skewness^2 - 1 of the places along an axis is zero for points on two lines,
 0.5 on three, 0.8 for evenly spread ones. Two lines always lie on some plane, so they prove none."""
 
+MIN_CHANNELS = 3
+"""Channels of a patch at least, where they are known and so many fit into one. The rings of two are
+curved, so that they pass for three lines; where they fall on either side of a kerb, all that is
+seen of it is a tilt."""
+
 MAX_BEND_M = 0.005
 """Greatest root mean square of bend and steps (second and third order) beyond what noise makes: a
 corner or a reveal of 3 cm within the patch makes more."""
@@ -103,6 +112,7 @@ class ScanPatches:
         normal_lidar: (n, 3) unit, towards the LiDAR.
         scatter_m: (n,) standard deviation along the normal.
         swept: how points were moved to that time; None without motion.
+        channels: what the points of each channel add; None: the scan has none.
         undecided: points in groups that are too few or too thin to be judged.
         uneven: points in groups that are not flat.
         grazing: points in flat groups under a flat angle or too long.
@@ -113,21 +123,21 @@ class ScanPatches:
     normal_lidar: Array
     scatter_m: Array
     swept: Swept | None = None
+    channels: ChannelSums | None = None
     undecided: int = 0
     uneven: int = 0
     grazing: int = 0
 
     def part(self, keep: BoolArray | IntArray) -> ScanPatches:
         """Some of the patches; the counts stay."""
-        return ScanPatches(
-            self.time_s[keep],
-            self.moments[keep],
-            self.normal_lidar[keep],
-            self.scatter_m[keep],
-            self.swept and self.swept.part(keep),
-            self.undecided,
-            self.uneven,
-            self.grazing,
+        return replace(
+            self,
+            time_s=self.time_s[keep],
+            moments=self.moments[keep],
+            normal_lidar=self.normal_lidar[keep],
+            scatter_m=self.scatter_m[keep],
+            swept=self.swept and self.swept.part(keep),
+            channels=self.channels and self.channels.part(keep, len(self.time_s)),
         )
 
 
@@ -151,6 +161,7 @@ def planar_patches(
     sigma_range_m: float,
     times_s: Array | None = None,
     motion: SweepMotion | None = None,
+    by_channel: bool = False,
 ) -> ScanPatches:
     """The flat patches of a scan.
 
@@ -159,9 +170,11 @@ def planar_patches(
         sigma_range_m: noise along the beam, 1 sigma.
         times_s: (N,) seconds after the stamp; None: all at the stamp.
         motion: of the LiDAR, over the span of these times; given with them.
+        by_channel: whether what the points of each channel add is kept, where it has channels.
     """
     points, times_s = _even_part(points, times_s)
     cells = _cells(points)
+    channels = PointChannels.found(points) if by_channel else None
     slot = np.zeros(len(points), dtype=np.int64)
     if times_s is not None and motion is not None:
         slot = np.clip(((times_s - motion.first_s) / SLOT_S).astype(np.int64), 0, None)
@@ -173,7 +186,8 @@ def planar_patches(
         groups = _grouped(cells, left, undone, slot)
         left = left[groups.order]
         at, times = points[left], None if times_s is None else times_s[left]
-        patches, judged = _judged(groups, at, times, motion, slot[left], sigma_range_m)
+        own = channels and channels.only(left)
+        patches, judged = _judged(groups, at, times, motion, slot[left], sigma_range_m, own)
         found.append(patches)
         uneven += patches.uneven
         grazing += patches.grazing
@@ -263,6 +277,7 @@ def _judged(
     motion: SweepMotion | None,
     slot: IntArray,
     sigma_range_m: float,
+    channels: PointChannels | None,
 ) -> tuple[ScanPatches, BoolArray]:
     """Patches among the groups; and for each point whether its group is decided, flat or not."""
     enough = groups.count >= MIN_POINTS
@@ -304,6 +319,10 @@ def _judged(
     broad = (width[:, 1] > MIN_WIDTH * np.maximum(scatter, 1e-6)) & (tilt < MAX_TILT_RAD)
     spread, bend, skewness, length = _shape(p, group, first, count, centre, axes, width)
     broad &= spread > MIN_SPREAD
+    if channels is not None:
+        several, span = channels.only(chosen).number(first)
+        apart = range_m * span / np.maximum(cosine, MIN_INCIDENCE_COS)
+        broad &= (several >= MIN_CHANNELS) | (2.0 * apart > MAX_PATCH_M)
     uneven = bend > MAX_BEND_M + 2.0 * scatter / np.sqrt(count)
     uneven |= np.abs(skewness) > np.maximum(MAX_SKEWNESS * np.sqrt(6.0 / count), LEAST_SKEWNESS)
     seen = (cosine > MIN_INCIDENCE_COS) & (length < MAX_PATCH_M)
@@ -311,12 +330,18 @@ def _judged(
     decided = ~flat | broad
     judged = np.zeros(len(points), dtype=bool)
     judged[chosen] = decided[group]
+    by_channel = None
+    if channels is not None:
+        kept = good[group]
+        number = np.cumsum(good) - 1
+        by_channel = channels.only(chosen).only(kept).sums(p[:, kept], number[group[kept]])
     patches = ScanPatches(
         time_s=time_s[good],
         moments=moments[good],
         normal_lidar=normal[good],
         scatter_m=scatter[good],
         swept=swept and swept.part(good),
+        channels=by_channel,
         uneven=int(count[decided & (~flat | uneven)].sum()),
         grazing=int(count[flat & broad & ~uneven & ~seen].sum()),
     )
@@ -382,25 +407,19 @@ def _shape(
 
 def _joined(found: list[ScanPatches], points: int, uneven: int, grazing: int) -> ScanPatches:
     """All patches of a scan, at most `MAX_PATCHES`, and what became of its points."""
+    number = [len(f.time_s) for f in found]
+    moments = np.concatenate([f.moments for f in found])
+    used = int(moments[:, 3, 3].sum())
     joined = ScanPatches(
         time_s=np.concatenate([f.time_s for f in found]),
-        moments=np.concatenate([f.moments for f in found]),
+        moments=moments,
         normal_lidar=np.concatenate([f.normal_lidar for f in found]),
         scatter_m=np.concatenate([f.scatter_m for f in found]),
-        swept=Swept.joined([f.swept for f in found], [len(f.time_s) for f in found]),
+        swept=Swept.joined([f.swept for f in found], number),
+        channels=ChannelSums.joined([f.channels for f in found], number),
+        undecided=points - used - uneven - grazing,
         uneven=uneven,
         grazing=grazing,
-    )
-    used = int(joined.moments[:, 3, 3].sum())
-    joined = ScanPatches(
-        joined.time_s,
-        joined.moments,
-        joined.normal_lidar,
-        joined.scatter_m,
-        joined.swept,
-        points - used - uneven - grazing,
-        uneven,
-        grazing,
     )
     if len(joined.time_s) <= MAX_PATCHES:
         return joined

@@ -16,6 +16,7 @@ from caliv_graph.geometry.se3 import (
     vehicle_axes_difference,
 )
 from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.beams import BeamNodes, beam_groups
 from caliv_graph.structure.layout import Layout, State
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
@@ -56,7 +57,7 @@ class Problem:
         range_errors: what is stated of the errors of the ranges.
         turn_rad_s: (P, 3) 1 sigma of the errors of the angular velocity within the scans at each of
             the P poses with a scan, vehicle axes (`turns.py`); empty: points are taken at once.
-        beam_nodes: elevations of each LiDAR at which its beams err (`beams.py`); empty: none do.
+        beam_nodes: of each LiDAR, where its beams err (`beams.py`); empty: none do.
         bent: whether strips are bent (`bends.py`); else they are flat.
     """
 
@@ -75,7 +76,7 @@ class Problem:
     range_errors: RangeErrors = UNSTATED
     accelerations: Array | None = None
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    beam_nodes: tuple[Array, ...] = ()
+    beam_nodes: tuple[BeamNodes, ...] = ()
     bent: bool = False
 
     @property
@@ -180,6 +181,11 @@ def placed_sightings(
     if problem.bent and strips.count:
         centres = np.einsum("nij,nj->ni", back, strips.centres_map[own] - placed.t_map_lidar)
         bent = centres, tangent_axes(strips.normals_map)[own] @ placed.R_map_lidar
+    beams = None
+    if problem.beam_nodes:
+        lidar = problem.patches.scan_lidar[problem.patches.scan]
+        since = _motion_since_stamp(problem, placed.T_vehicle_lidar, lidar)
+        beams = beam_groups(problem.patches, problem.beam_nodes, normals, *since)
     return sightings_of(
         problem.patches,
         placed.moments_at_stamp,
@@ -188,7 +194,7 @@ def placed_sightings(
         strips,
         range_sigma_m,
         placed.T_vehicle_lidar,
-        problem.beam_nodes,
+        beams,
         bent,
     )
 
@@ -203,7 +209,7 @@ def layout_of(problem: Problem, strips: Strips) -> Layout:
         lidars=len(problem.patches.lidars),
         surface_of=tuple(strips.surface.tolist()),
         turns=problem.turn_rad_s.size,
-        beams=tuple(map(len, problem.beam_nodes)),
+        beams=tuple(nodes.errors for nodes in problem.beam_nodes),
         bent=problem.bent,
     )
 
@@ -214,12 +220,19 @@ def _at_stamp(problem: Problem, state: State, lidar: IntArray) -> tuple[Array, A
     scatter = patches.scatter_along_beam_m
     if not patches.time_s.any():
         return patches.moments, patches.normal_lidar, scatter
-    T = np.array([T.matrix() for T in state.T_vehicle_lidar])
-    inverse = np.array([T.inverse().matrix() for T in state.T_vehicle_lidar])
-    moved = inverse[lidar] @ problem.relative @ T[lidar]
-    R, t = moved[:, :3, :3], moved[:, :3, 3]
+    R, t = _motion_since_stamp(problem, state.T_vehicle_lidar, lidar)
     normals, scatter = (np.einsum("nij,nj->ni", R, v) for v in (patches.normal_lidar, scatter))
     return moved_moments(patches.moments, R, t), normals, scatter
+
+
+def _motion_since_stamp(
+    problem: Problem, T_vehicle_lidar: tuple[gtsam.Pose3, ...], lidar: IntArray
+) -> tuple[Array, Array]:
+    """R (N, 3, 3) and t (N, 3) of the LiDAR of each patch in its own frame at the scan's stamp."""
+    T = np.array([T.matrix() for T in T_vehicle_lidar])
+    inverse = np.array([T.inverse().matrix() for T in T_vehicle_lidar])
+    moved = inverse[lidar] @ problem.relative @ T[lidar]
+    return moved[:, :3, :3], moved[:, :3, 3]
 
 
 def groups_of(sightings: Sightings, strips: Strips) -> IntArray:

@@ -14,6 +14,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
+from caliv_graph.structure.channels import ChannelSums
 from caliv_graph.structure.patches import DrivePatches, Swept
 from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
 from caliv_graph.targets.cloud.views import evenly_spread
@@ -238,7 +239,7 @@ def scan_patches(
     motion = None
     if times_s is not None:
         motion = _sweep_motion(scan.stamp_ns, times_s, T_vehicle_lidar, trajectory)
-    patches = planar_patches(scan.points_lidar, sigma_range_m, times_s, motion)
+    patches = planar_patches(scan.points_lidar, sigma_range_m, times_s, motion, by_channel=True)
     begin, end = trajectory.span_ns
     at = scan.stamp_ns + np.round(patches.time_s * NANOSECONDS_PER_SECOND).astype(np.int64)
     keep: BoolArray = (at >= begin) & (at <= end)
@@ -291,4 +292,5 @@ def _together(
         scatter_m=np.concatenate([np.zeros(0), *(p.scatter_m for p in parts)]),
         swept=Swept.joined([p.swept for p in parts], number),
         moved_with=moved_with,
+        channels=ChannelSums.joined([p.channels for p in parts], number),
     )

@@ -12,7 +12,6 @@ import scipy.sparse
 
 from caliv_graph.geometry.se3 import skew, stack, tangent_axes, twist_by_turn
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.structure.beams import KINDS
 from caliv_graph.structure.bends import BENDS
 from caliv_graph.structure.layout import BIASES, Layout, State
 from caliv_graph.structure.sightings import Sightings
@@ -244,9 +243,8 @@ def geometry_of(
         moved.append((by_turn_rate, own, state.errors[own]))
     beams = sightings.beams
     if beams is not None:
-        own = layout.beam + KINDS * beams.node[:, :, None] + np.arange(KINDS)
-        own = own.reshape(q, -1)
-        moved.append((beams.by.reshape(q, -1, 4), own, state.errors[own]))
+        own = layout.beam + beams.column
+        moved.append((beams.by, own, state.errors[own]))
     if layout.bent:
         own = layout.bend + layout.strips * np.arange(BENDS) + strip[:, None]
         bends = np.zeros((q, BENDS, 4)) if sightings.bends is None else sightings.bends

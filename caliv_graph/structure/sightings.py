@@ -9,7 +9,7 @@ import numpy as np
 
 from caliv_graph.config.range_errors import GRAZING_COS
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.structure.beams import SeenBeams, elevations, seen_beams
+from caliv_graph.structure.beams import BeamGroups, SeenBeams, seen_beams
 from caliv_graph.structure.bends import seen_bends
 from caliv_graph.structure.patches import DrivePatches, along_surface
 from caliv_graph.structure.strips import Strips
@@ -23,6 +23,10 @@ BEAM_RAD = 3e-4
 TILT_LENGTH_M = 1.0
 """Distance over which the error of a sighting changes by its own sigma: half a strip. How beams
 fall on joints, edges and bumps differs over a strip as much as from scan to scan."""
+
+GROUND_TILT_LENGTH_M = 0.5
+"""The same on ground: the width of a patch. There a patch has three rings, each on bumps of its
+own; tilts of sightings are 2.3 mrad on streets of a simulator where offsets are 0.8 mm."""
 
 
 MIN_COS = GRAZING_COS
@@ -44,6 +48,8 @@ class Sightings:
         time_s: (Q,) weighted mean of the times of the points, seconds after the scan's stamp.
         T_vehicle_lidar: of each LiDAR, with which points of other times were moved to the stamps.
         beams: what errors of the beams add; None: they have none.
+        tilt_length_m: (Q,) distance over which the own error of each changes by its sigma; None:
+            `TILT_LENGTH_M`.
         bends: (Q, BENDS, 4) what bends of the strips add (`bends.py`); None: strips are flat.
     """
 
@@ -55,6 +61,7 @@ class Sightings:
     T_vehicle_lidar: tuple[gtsam.Pose3, ...]
     beams: SeenBeams | None = None
     bends: Array | None = None
+    tilt_length_m: Array | None = None
 
     @property
     def count(self) -> int:
@@ -77,6 +84,7 @@ class Sightings:
             time_s=self.time_s[keep],
             beams=self.beams and self.beams.only(keep),
             bends=None if self.bends is None else self.bends[keep],
+            tilt_length_m=None if self.tilt_length_m is None else self.tilt_length_m[keep],
         )
 
 
@@ -108,7 +116,7 @@ def sightings_of(
     strips: Strips,
     range_sigma_m: Array,
     T_vehicle_lidar: tuple[gtsam.Pose3, ...],
-    beam_nodes: tuple[Array, ...] = (),
+    beams: BeamGroups | None = None,
     bent: tuple[Array, Array] | None = None,
 ) -> Sightings:
     """Adds up the patches of each strip in each scan.
@@ -121,7 +129,7 @@ def sightings_of(
         strips: which patch is on which.
         range_sigma_m: (L,) noise along the beam of each LiDAR.
         T_vehicle_lidar: of each LiDAR, with which points were moved to the stamp.
-        beam_nodes: elevations of each LiDAR at which its beams err (`beams.py`); empty: none do.
+        beams: what errors of the beams do to the patches; None: they have none.
         bent: centres (N, 3) of their strips in that frame, and axes (N, 2, 3), of patches on a
             strip; None: strips are flat.
     """
@@ -137,22 +145,19 @@ def sightings_of(
         return Sightings(none, none, nothing, nothing, np.zeros(0), T_vehicle_lidar)
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     centres = moments_at_stamp[own, :3, 3] / moments_at_stamp[own, 3, 3, None]
-    lidar = patches.scan_lidar[patches.scan[own]]
-    sigma = range_sigma_m[lidar]
-    weight = point_weights(centres, normals_at_stamp[own], sigma)
+    sigma = range_sigma_m[patches.scan_lidar[patches.scan[own]]]
+    normals = normals_at_stamp[own]
+    weight = point_weights(centres, normals, sigma)
     weighted = weight[:, None, None] * moments_at_stamp[own]
     moments = np.add.reduceat(weighted, starts)
-    beams = None
-    if beam_nodes:
-        elevation = elevations(patches)[own]
-        beams = seen_beams(
-            beam_nodes, elevation, lidar, centres, normals_at_stamp[own], weighted, starts
-        )
+    of_beams = None
+    if beams is not None:
+        number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(own)))
+        of_beams = seen_beams(beams, own, number, weight, moments, normals[starts])
     bends = None
     if bent is not None:
         middles, axes = (part[own] for part in bent)
-        of_strip, normals = strips.of_patch[own], normals_at_stamp[own]
-        bends = seen_bends(weighted, middles, axes, normals, of_strip, starts)
+        bends = seen_bends(weighted, middles, axes, normals, strips.of_patch[own], starts)
     noise = np.zeros_like(moments)
     of_patch = weight * moments_at_stamp[own, 3, 3]
     along = np.sqrt(weight)[:, None] * scatter_at_stamp[own]
@@ -164,8 +169,11 @@ def sightings_of(
         noise=noise,
         time_s=np.add.reduceat(of_patch * patches.time_s[own], starts) / moments[:, 3, 3],
         T_vehicle_lidar=T_vehicle_lidar,
-        beams=beams,
+        beams=of_beams,
         bends=bends,
+        tilt_length_m=np.where(
+            strips.level[strips.of_patch[own[starts]]], GROUND_TILT_LENGTH_M, TILT_LENGTH_M
+        ),
     )
 
 
@@ -176,12 +184,13 @@ def without_own_error(
 
     That error is an offset and two tilts: `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`. However many
     points it has, a sighting knows its strip no better than `offset_m` (Q,) at its middle, and its
-    tilt no better than `tilt_m` (Q,) over `TILT_LENGTH_M`. `normals_lidar` (Q, 3) at the scan's
-    stamp.
+    tilt no better than `tilt_m` (Q,) over `Sightings.tilt_length_m`. `normals_lidar` (Q, 3) at the
+    scan's stamp.
     """
     S = sightings.moments
     N = along_surface(S, normals_lidar)
-    N[:, :, 1:] /= TILT_LENGTH_M
+    length_m = TILT_LENGTH_M if sightings.tilt_length_m is None else sightings.tilt_length_m
+    N[:, :, 1:] /= np.reshape(length_m, (-1, 1, 1))
     SN = S @ N
     inner = np.swapaxes(N, 1, 2) @ SN
     inner[:, range(3), range(3)] += np.stack([offset_m, tilt_m, tilt_m], axis=1) ** -2.0

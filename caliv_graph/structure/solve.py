@@ -13,7 +13,7 @@ import numpy as np
 from caliv_graph.common.memory import give_back_freed_memory
 from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.beams import KINDS
+from caliv_graph.structure.beams import usual_sigmas
 from caliv_graph.structure.bends import USUAL_PER_M
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
 from caliv_graph.structure.jitter import jitter_sigma_s, told_clocks, told_of_jitters
@@ -23,6 +23,7 @@ from caliv_graph.structure.noise import (
     fitted_noise,
     range_sigmas,
     robust_weights,
+    tilt_weights,
 )
 from caliv_graph.structure.problem import (
     Problem,
@@ -148,8 +149,8 @@ class Solved(Estimate):
 class Levels:
     """Noise levels, alike for all strips, with which a round begins: those of `Nuisances`.
 
-    `beams` is (N, KINDS), or (1, KINDS) where all elevations are alike; `bend_per_m` is that of
-    level strips, and of others.
+    `beams` is (E,), as of `Nuisances`, or None: as is usual; `bend_per_m` is that of level strips,
+    and of others.
     """
 
     sighting_m: float
@@ -157,26 +158,13 @@ class Levels:
     shared_m: float
     surface_m: float
     bias_m: float
-    beams: Array
+    beams: Array | None = None
     bend_per_m: tuple[float, float] = (USUAL_PER_M, USUAL_PER_M)
 
     @staticmethod
     def first(sighting_m: float, strip_m: float, shared_m: float, ranges: RangeErrors) -> Levels:
         """Some levels, and what is known of the ranges before any data."""
-        return Levels(
-            sighting_m,
-            strip_m,
-            shared_m,
-            ranges.surface_m,
-            ranges.offsets.usual,
-            np.array([ranges.beams]),
-        )
-
-    def of_beams(self, elevations: int) -> Array:
-        """(N, KINDS) at N elevations, which are those that `beams` is of; 0: beams do not err."""
-        if not elevations:
-            return self.beams[:0]
-        return np.broadcast_to(self.beams, (elevations, self.beams.shape[1]))
+        return Levels(sighting_m, strip_m, shared_m, ranges.surface_m, ranges.offsets.usual)
 
 
 def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
@@ -242,13 +230,13 @@ def _rough(
     levels = Levels.first(
         FIRST_SIGHTING_M, FIRST_SIGHTING_M, FIRST_SIGHTING_M, problem.range_errors
     )
-    more, beam = KINDS * sum(map(len, problem.beam_nodes)), 0
+    more, beam = sum(nodes.errors.size for nodes in problem.beam_nodes), 0
     for gate in ROUGH_GATES_M:
         found = _round(some, rough, range_sigma, gate, levels)
         if found is None:
             break
         found = _settled(found, steps=2)
-        levels = replace(found.levels(), beams=levels.beams, bend_per_m=levels.bend_per_m)
+        levels = replace(found.levels(), beams=None, bend_per_m=levels.bend_per_m)
         rough, beam = found.state, found.layout.beam
     if len(rough.errors):
         rough = replace(rough, errors=np.insert(rough.errors, np.full(more, beam), 0.0))
@@ -365,7 +353,9 @@ def _round(
         sighting=np.full(strips.count, levels.sighting_m),
         shared=levels.shared_m,
         repeated=0.0,
-        beams=levels.of_beams(sum(layout.beams)),
+        beams=usual_sigmas(layout.beams, problem.range_errors)
+        if levels.beams is None
+        else levels.beams,
         bend=np.where(strips.level, *levels.bend_per_m),
         turn_rad_s=problem.turn_rad_s,
     )
@@ -411,7 +401,8 @@ def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
         problem.range_errors,
         found.strips.level,
     )
-    weights = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
+    by_offset = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
+    weights = np.minimum(by_offset, tilt_weights(geometry, sightings, found.strips.level))
     step = d[layout.extrinsic : layout.error]
     cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
     after = replace(found, state=state, weights=weights, nuisances=nuisances, geometry=geometry)

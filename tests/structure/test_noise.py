@@ -5,8 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caliv_graph.structure.noise import range_sigmas
+from caliv_graph.config.range_errors import UNSTATED
+from caliv_graph.products import Array
+from caliv_graph.structure.beams import (
+    CHANNEL_KINDS,
+    MEANS,
+    BeamErrors,
+    mean_rows,
+    parts_of,
+    usual_sigmas,
+)
+from caliv_graph.structure.noise import beam_sigmas, range_sigmas, tilt_weights
 from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.residuals import Geometry
+from caliv_graph.structure.sightings import Sightings
 
 POINTS = 20
 
@@ -46,3 +58,74 @@ def test_noise_along_beams_is_found_whatever_that_of_their_directions(
 
 def test_what_is_stated_counts_where_there_are_few_patches() -> None:
     assert range_sigmas(patches_of(0.01, 0.0, 200), 0.03).tolist() == [0.03]
+
+
+CHANNELS = 32
+RANGES = (BeamErrors(CHANNELS, CHANNEL_KINDS),)
+
+
+def sizes_of(true: Array, usual: Array, shared: Array | float = 0.0) -> Array:
+    """(E,) sigmas of errors of one LiDAR, which the data say to a third of their usual size.
+
+    And a `shared` error (3,) of each kind, which the data see as errors of all: a bias, or the yaw.
+    """
+    cov = np.diag((usual / 3.0) ** 2)
+    for _, kind, part in parts_of(RANGES):
+        if kind in MEANS:
+            cov[part, part] += (2.0 * usual[part][0]) ** 2
+    data = np.asarray(np.linalg.inv(cov), dtype=np.float64)
+    J, _ = mean_rows(RANGES, 0, true)
+    pull = data @ (true + np.repeat(shared * np.ones(CHANNEL_KINDS), CHANNELS))
+    return beam_sigmas(data, (J.T @ J).toarray(), pull, usual, RANGES, UNSTATED)
+
+
+def test_what_all_channels_share_says_nothing_of_their_size() -> None:
+    """The range bias of a LiDAR, and its yaw: each has a variable of its own."""
+    rng = np.random.default_rng(6)
+    usual = usual_sigmas(RANGES, UNSTATED)
+    true = 3.0 * usual * rng.standard_normal(len(usual))
+    alone = sizes_of(true, usual)
+    assert 1.5 < np.median(alone / usual) < 3.5
+    found = sizes_of(true, usual, np.array([30e-3, 0.0, 2e-3]))
+    np.testing.assert_allclose(found, alone, rtol=0.1)
+
+
+def test_two_channels_that_err_much_are_not_all_of_them() -> None:
+    rng = np.random.default_rng(7)
+    usual = usual_sigmas(RANGES, UNSTATED)
+    true = 2.0 * usual * rng.standard_normal(len(usual))
+    true[[CHANNELS + 3, CHANNELS + 4]] = 5e-3, -5e-3
+    found = sizes_of(true, usual)[CHANNELS : 2 * CHANNELS]
+    assert np.median(found) == pytest.approx(1e-4, rel=0.3)
+    assert found[[3, 4]].min() > 1e-3
+
+
+def test_a_sighting_that_is_tilted_has_no_weight_though_its_middle_is_right() -> None:
+    """Points of ground 1.8 m below, one sighting in twenty over a kerb; one is a single line."""
+    rng = np.random.default_rng(8)
+    x, y = (g.ravel() for g in np.meshgrid(np.linspace(4.0, 5.0, 6), np.linspace(-0.3, 0.3, 8)))
+    moments = np.zeros((40, 4, 4))
+    slopes = 2e-3 * rng.standard_normal((40, 2))
+    slopes[[3, 20]] = [0.1, 0.0], [0.0, -0.05]
+    for own, (along, across) in zip(moments, slopes, strict=True):
+        z = -1.8 + along * (x - x.mean()) + across * (y - y.mean())
+        h = np.column_stack([x, y, z + 0.003 * rng.standard_normal(len(x)), np.ones(len(x))])
+        own[:] = h.T @ h * 0.003**-2.0
+    line = np.column_stack([np.full(8, 4.5), y[::6], np.full(8, -1.8), np.ones(8)])
+    moments[30] = line.T @ line * 0.003**-2.0
+    none = np.zeros(40, np.int64)
+    sightings = Sightings(none, none, moments, np.zeros_like(moments), np.zeros(40), ())
+    up = np.tile([0.0, 0.0, 1.0], (40, 1))
+    geometry = Geometry(
+        plain=np.column_stack([up, np.full(40, 1.8)]),
+        by=np.zeros((40, 0, 4)),
+        columns=np.zeros((40, 0), np.int64),
+        normals_lidar=up,
+    )
+    assert np.abs(geometry.offsets_m(sightings)).max() < 0.002
+    weights = tilt_weights(geometry, sightings, np.ones(1, bool))
+    walls = tilt_weights(geometry, sightings, np.zeros(1, bool))
+    assert (walls == 1.0).all()
+    assert np.flatnonzero(weights < 0.5).tolist() == [3, 20]
+    assert weights[[3, 20]].tolist() == [0.0, 0.0]
+    assert weights[30] == 1.0

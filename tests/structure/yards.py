@@ -10,7 +10,8 @@ import gtsam
 import numpy as np
 
 from caliv_graph.geometry.se3 import stack
-from caliv_graph.products import Array
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.channels import ChannelSums, PointChannels
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 
@@ -83,6 +84,20 @@ class Noise:
     channel_m: float = 0.0
 
 
+CHANNEL_DEG = 0.5
+"""Height of a channel."""
+
+
+def channel_of(elevation_rad: Array) -> IntArray:
+    """Index of the channel at elevations."""
+    return np.asarray(np.degrees(elevation_rad) // CHANNEL_DEG + 180).astype(np.int64)
+
+
+def channel_errors(noise: Noise, lidar: int) -> Array:
+    """(360,) by how much the ranges of each channel of a LiDAR are too long, metres."""
+    return noise.channel_m * np.random.default_rng([lidar, 7]).standard_normal(360)
+
+
 def draw_patches(
     walls: Sequence[Wall],
     T_map_vehicle: Sequence[gtsam.Pose3],
@@ -98,10 +113,11 @@ def draw_patches(
     cells = [rng.standard_normal((40, 10)) * noise.bump_m for _ in walls]
     out: dict[str, list[Any]] = {k: [] for k in ("scan", "moments", "normal", "scatter")}
     stamps, scan_lidar = [], []
+    of_channels: list[ChannelSums | None] = []
     scan = 0
     for number, T in enumerate(extrinsics.values()):
         bias = rng.standard_normal() * noise.bias_m
-        channels = noise.channel_m * np.random.default_rng([number, 7]).standard_normal(360)
+        channels = channel_errors(noise, number)
         for i, X in enumerate(T_map_vehicle):
             stamps.append(i * STEP_NS)
             scan_lidar.append(number)
@@ -137,10 +153,15 @@ def draw_patches(
                     q += np.outer(cells[w][cu, cv] + own_error, normal)
                     q_l = (q - t) @ R
                     r = np.linalg.norm(q_l, axis=1)
-                    own_channel = (np.degrees(np.arcsin(q_l[:, 2] / r)) // 0.5 + 180).astype(int)
+                    own_channel = channel_of(np.arcsin(q_l[:, 2] / r))
                     long = bias + channels[own_channel]
                     q_l *= (1.0 + (long + rng.standard_normal(n) * noise.range_m) / r)[:, None]
                     h = np.column_stack([q_l, np.ones(n)])
+                    seen_by, which = np.unique(own_channel, return_inverse=True)
+                    middles = np.radians(CHANNEL_DEG * (seen_by - 179.5))
+                    of_channels.append(
+                        PointChannels(middles, which).sums(q_l.T, np.zeros(n, np.int64))
+                    )
                     c = q_l.mean(axis=0)
                     values, vectors = np.linalg.eigh((q_l - c).T @ (q_l - c) / n)
                     nu = vectors[:, 0]
@@ -159,6 +180,9 @@ def draw_patches(
         moments=np.array(out["moments"]),
         normal_lidar=np.array(out["normal"]),
         scatter_m=np.array(out["scatter"]),
+        channels=ChannelSums.joined(of_channels, [1] * len(of_channels))
+        if noise.channel_m
+        else None,
     )
 
 

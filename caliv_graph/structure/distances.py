@@ -316,9 +316,7 @@ def _measured(
     group = groups_of(sightings, strips)
     repeated = problem.views.count[sightings.scan]
     same = alike(problem, sightings)
-    rows = whitened(
-        geometry, sightings, group, repeated, same, other.nuisances, weights, layout.size
-    )
+    rows = whitened(geometry, sightings, group, repeated, same, other.nuisances, weights, layout)
     found = _Distances(other, rows)
     offsets, by_plane = geometry.offsets_m(sightings), plane_rows(geometry, sightings)
     thickness = thickness_m(by_plane, sightings, weights, offsets, strips.count)

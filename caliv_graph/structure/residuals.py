@@ -34,12 +34,14 @@ class Geometry:
 
     Attributes:
         plain: (Q, 4) the residual, metres.
+        placed: (Q, 4) the part of it that is by places of points, not by errors of their beams.
         by: (Q, C, 4) its derivatives.
         columns: (Q, C) coordinates of these.
         normals_lidar: (Q, 3) normals of the strips in the lidar frame at the scan's stamp.
     """
 
     plain: Array
+    placed: Array
     by: Array
     columns: IntArray
     normals_lidar: Array
@@ -191,7 +193,7 @@ def geometry_of(
     plain = np.zeros((q, 4))
     plain[:, :3] = m
     plain[:, 3] = np.einsum("qi,qi->q", normal, t - centre)
-    plain += np.einsum("qe,qei->qi", state.errors[error_columns], by_error)
+    of_beams = np.einsum("qe,qei->qi", state.errors[error_columns], by_error)
 
     normals = state.normals_map if dents else smooth_normals(state.normals_map, layout)
     smooth = np.einsum("qji,qj->qi", R, normals[strip])
@@ -244,7 +246,9 @@ def geometry_of(
     beams = sightings.beams
     if beams is not None:
         own = layout.beam + beams.column
-        moved.append((beams.by, own, state.errors[own]))
+        of_beams += np.einsum("qc,qci->qi", state.errors[own], beams.by)
+        parts.append(beams.by)
+        columns.append(own)
     if layout.bent:
         own = layout.bend + layout.strips * np.arange(BENDS) + strip[:, None]
         bends = np.zeros((q, BENDS, 4)) if sightings.bends is None else sightings.bends
@@ -253,7 +257,8 @@ def geometry_of(
         plain += np.einsum("qc,qci->qi", value, by)
         parts.append(by)
         columns.append(own)
-    return Geometry(plain, np.concatenate(parts, axis=1), np.concatenate(columns, axis=1), m)
+    by, column = np.concatenate(parts, axis=1), np.concatenate(columns, axis=1)
+    return Geometry(plain + of_beams, plain, by, column, m)
 
 
 def _by_compensation(time_s: Array, twists_lidar: Array, by_extrinsic: Array) -> Array:

@@ -8,13 +8,17 @@ import numpy as np
 import scipy.sparse
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.layout import Nuisances
+from caliv_graph.structure.layout import Layout, Nuisances
 from caliv_graph.structure.residuals import PLANE_ROWS, Geometry, rows_of
 from caliv_graph.structure.sightings import Sightings, without_own_error
 
 MOST_NOISE = 0.5
 """Largest part of a strip's information on its tilt that may be noise of the points."""
 
+FITTED = 2.5
+"""Points fewer by which the noise counts in what errors of beams add to sightings: these are fitted
+to the points, noise included. Of 12 points in two channels 0.79 of it are there, of 21 in three
+0.88, of 40 in four 0.93 (simulated)."""
 
 TILT_PRIOR_RAD = 5.0
 
@@ -70,13 +74,13 @@ def whitened(
     alike: IntArray,
     nuisances: Nuisances,
     weights: Array,
-    size: int,
+    layout: Layout,
 ) -> Rows:
     """Residuals by the noise of points and sightings, the latter eliminated.
 
     `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
     view: what these share counts as often, so that their mean has the error of one. `alike` (Q,)
-    says how many sightings of its strip its LiDAR has. `weights` (Q,) are robust, `size` is D.
+    says how many sightings of its strip its LiDAR has. `weights` (Q,) are robust.
     """
     more = repetition(nuisances, repeated)
     own = nuisances.sighting[sightings.strip] * more
@@ -89,7 +93,7 @@ def whitened(
     C = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     data = np.swapaxes(geometry.by @ C, 1, 2)
     q = sightings.count
-    J = rows_of(data, geometry.columns, size)
+    J = rows_of(data, geometry.columns, layout.size)
     J.eliminate_zeros()
     groups, number = np.unique(group, return_inverse=True)
     by_offset = (nuisances.shared * more)[:, None] * C[:, 3]
@@ -98,9 +102,16 @@ def whitened(
         (by_offset.ravel(), (np.arange(4 * q), own_group.ravel())), shape=(4 * q, len(groups))
     )
     noise *= _bearable(geometry, S, noise, sightings.strip)[:, None, None]
-    of_plane = np.einsum("qij,qj->qi", noise, geometry.plain)
+    of_plane = np.einsum("qij,qj->qi", noise, geometry.placed)
     pull = np.einsum("qci,qi->qc", geometry.by, of_plane)
-    of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=size)
+    of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=layout.size)
+    beams = sightings.beams
+    if beams is not None:
+        less = -FITTED / sightings.points[:, None]
+        own = less * np.einsum("qci,qi->qc", beams.by, of_plane)
+        of_noise += np.bincount(
+            (layout.beam + beams.column).ravel(), own.ravel(), minlength=layout.size
+        )
     of_offset = nuisances.shared * more * of_plane[:, 3]
     of_groups = np.bincount(number.ravel(), of_offset, len(groups))
     r = np.einsum("qi,qij->qj", geometry.plain, C).ravel()

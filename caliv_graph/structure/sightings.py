@@ -46,6 +46,7 @@ class Sightings:
             is fitted to moments with noise in them turns towards the beams: on ground by 0.1 mrad
             for a LiDAR on a roof, by 20 for one at the bumper, of each to its own side.
         time_s: (Q,) weighted mean of the times of the points, seconds after the scan's stamp.
+        points: (Q,) their number.
         T_vehicle_lidar: of each LiDAR, with which points of other times were moved to the stamps.
         beams: what errors of the beams add; None: they have none.
         tilt_length_m: (Q,) distance over which the own error of each changes by its sigma; None:
@@ -58,6 +59,7 @@ class Sightings:
     moments: Array
     noise: Array
     time_s: Array
+    points: Array
     T_vehicle_lidar: tuple[gtsam.Pose3, ...]
     beams: SeenBeams | None = None
     bends: Array | None = None
@@ -82,6 +84,7 @@ class Sightings:
             moments=self.moments[keep],
             noise=self.noise[keep],
             time_s=self.time_s[keep],
+            points=self.points[keep],
             beams=self.beams and self.beams.only(keep),
             bends=None if self.bends is None else self.bends[keep],
             tilt_length_m=None if self.tilt_length_m is None else self.tilt_length_m[keep],
@@ -142,7 +145,7 @@ def sightings_of(
     own, key = own[order], key[order]
     if not len(own):
         none, nothing = np.zeros(0, np.int64), np.zeros((0, 4, 4))
-        return Sightings(none, none, nothing, nothing, np.zeros(0), T_vehicle_lidar)
+        return Sightings(none, none, nothing, nothing, np.zeros(0), np.zeros(0), T_vehicle_lidar)
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     centres = moments_at_stamp[own, :3, 3] / moments_at_stamp[own, 3, 3, None]
     sigma = range_sigma_m[patches.scan_lidar[patches.scan[own]]]
@@ -168,6 +171,7 @@ def sightings_of(
         moments=moments,
         noise=noise,
         time_s=np.add.reduceat(of_patch * patches.time_s[own], starts) / moments[:, 3, 3],
+        points=np.add.reduceat(moments_at_stamp[own, 3, 3], starts),
         T_vehicle_lidar=T_vehicle_lidar,
         beams=of_beams,
         bends=bends,

@@ -97,7 +97,7 @@ class Estimate:
                 alike(problem, sightings),
                 self.nuisances,
                 self.weights,
-                self.layout.size,
+                self.layout,
             ),
             self.state,
             self.layout,

@@ -9,7 +9,6 @@ from caliv_graph.config.range_errors import UNSTATED
 from caliv_graph.products import Array
 from caliv_graph.structure.beams import (
     CHANNEL_KINDS,
-    MEANS,
     BeamErrors,
     mean_rows,
     parts_of,
@@ -67,12 +66,12 @@ RANGES = (BeamErrors(CHANNELS, CHANNEL_KINDS),)
 def sizes_of(true: Array, usual: Array, shared: Array | float = 0.0) -> Array:
     """(E,) sigmas of errors of one LiDAR, which the data say to a third of their usual size.
 
-    And a `shared` error (3,) of each kind, which the data see as errors of all: a bias, or the yaw.
+    And a `shared` error (3,) of each kind, which the data see as errors of all: a bias, or how the
+    LiDAR is turned.
     """
     cov = np.diag((usual / 3.0) ** 2)
-    for _, kind, part in parts_of(RANGES):
-        if kind in MEANS:
-            cov[part, part] += (2.0 * usual[part][0]) ** 2
+    for _, _, part in parts_of(RANGES):
+        cov[part, part] += (2.0 * usual[part][0]) ** 2
     data = np.asarray(np.linalg.inv(cov), dtype=np.float64)
     J, _ = mean_rows(RANGES, 0, true)
     pull = data @ (true + np.repeat(shared * np.ones(CHANNEL_KINDS), CHANNELS))
@@ -80,13 +79,16 @@ def sizes_of(true: Array, usual: Array, shared: Array | float = 0.0) -> Array:
 
 
 def test_what_all_channels_share_says_nothing_of_their_size() -> None:
-    """The range bias of a LiDAR, and its yaw: each has a variable of its own."""
+    """The range bias of a LiDAR, its yaw, and its pitch: each has a variable of its own.
+
+    What the data say of the pitch may be five of their sigmas off, as they know it very well.
+    """
     rng = np.random.default_rng(6)
     usual = usual_sigmas(RANGES, UNSTATED)
     true = 3.0 * usual * rng.standard_normal(len(usual))
     alone = sizes_of(true, usual)
     assert 1.5 < np.median(alone / usual) < 3.5
-    found = sizes_of(true, usual, np.array([30e-3, 0.0, 2e-3]))
+    found = sizes_of(true, usual, np.array([30e-3, 0.5e-3, 2e-3]))
     np.testing.assert_allclose(found, alone, rtol=0.1)
 
 
@@ -114,10 +116,13 @@ def test_a_sighting_that_is_tilted_has_no_weight_though_its_middle_is_right() ->
     line = np.column_stack([np.full(8, 4.5), y[::6], np.full(8, -1.8), np.ones(8)])
     moments[30] = line.T @ line * 0.003**-2.0
     none = np.zeros(40, np.int64)
-    sightings = Sightings(none, none, moments, np.zeros_like(moments), np.zeros(40), ())
+    sightings = Sightings(
+        none, none, moments, np.zeros_like(moments), np.zeros(40), np.ones(40), ()
+    )
     up = np.tile([0.0, 0.0, 1.0], (40, 1))
     geometry = Geometry(
         plain=np.column_stack([up, np.full(40, 1.8)]),
+        placed=np.zeros((40, 4)),
         by=np.zeros((40, 0, 4)),
         columns=np.zeros((40, 0), np.int64),
         normals_lidar=up,

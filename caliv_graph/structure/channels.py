@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
+from numpy.lib.stride_tricks import sliding_window_view
 
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.targets.cloud.beams import elevations
@@ -92,7 +92,8 @@ def found_channels(elevation_rad: Array) -> Array | None:
     place = ((elevation_rad - elevation_rad.min()) / BIN_RAD).astype(np.int64)
     count = np.bincount(place)
     density = np.convolve(count, np.ones(3), mode="same")
-    most = maximum_filter1d(density, 2 * round(NEAR_RAD / BIN_RAD) + 1, mode="constant")
+    near = round(NEAR_RAD / BIN_RAD)
+    most = sliding_window_view(np.pad(density, near), 2 * near + 1).max(axis=1)
     inside = np.concatenate([[False], density > VALLEY * most, [False]])
     begin, end = np.flatnonzero(np.diff(inside.astype(np.int8))).reshape(-1, 2).T
     before = np.concatenate([[0], np.cumsum(count)])

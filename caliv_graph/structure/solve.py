@@ -354,7 +354,7 @@ def _round(
         shared=levels.shared_m,
         repeated=0.0,
         beams=usual_sigmas(layout.beams, problem.range_errors)
-        if levels.beams is None
+        if levels.beams is None or not layout.beams
         else levels.beams,
         bend=np.where(strips.level, *levels.bend_per_m),
         turn_rad_s=problem.turn_rad_s,

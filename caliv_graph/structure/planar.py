@@ -17,10 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caliv_graph.products import Array, BoolArray, IntArray
-from caliv_graph.structure.channels import (
-    ChannelSums,
-    PointChannels,
-)
+from caliv_graph.structure.channels import ChannelSums, PointChannels
 from caliv_graph.structure.patches import Swept
 
 PATCH_M = 0.5

@@ -58,6 +58,20 @@ def state_of(rng: np.random.Generator) -> State:
     )
 
 
+def above_ground(layout: Layout, centre_map: np.ndarray) -> State:
+    """One LiDAR at the origin of map and vehicle, and one level strip about a point (3,)."""
+    return State(
+        R_map_vehicle=np.eye(3)[None],
+        t_map_vehicle=np.zeros((1, 3)),
+        moved=np.zeros(6),
+        T_vehicle_lidar=(gtsam.Pose3(),),
+        offsets_s=np.zeros(1),
+        centres_map=centre_map[None],
+        normals_map=np.array([[0.0, 0.0, 1.0]]),
+        errors=np.zeros(layout.size),
+    )
+
+
 def geometry_at(state: State, sightings: Sightings, twists: np.ndarray) -> Geometry:
     return geometry_of(state, sightings, LAYOUT, LIDAR, POSE, twists, accelerations=ACCELERATIONS)
 
@@ -181,16 +195,7 @@ def test_a_range_that_is_too_long_is_undone_all_over_a_strip() -> None:
     layout = Layout(1, 0, (), 1, (0,))
     errors = np.zeros(layout.size)
     errors[layout.error] = 0.01
-    state = State(
-        np.eye(3)[None],
-        np.zeros((1, 3)),
-        np.zeros(6),
-        (gtsam.Pose3(),),
-        np.zeros(1),
-        np.array([[5.0, 0.0, -2.0]]),
-        np.array([[0.0, 0.0, 1.0]]),
-        errors,
-    )
+    state = replace(above_ground(layout, np.array([5.0, 0.0, -2.0])), errors=errors)
     zero = np.zeros(1, np.int64)
     nothing = np.zeros((1, 4, 4))
     sightings = Sightings(
@@ -283,16 +288,7 @@ def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them()
     p += np.array([6.0, 0.0, -2.0]) - p.mean(axis=0)
     h = np.column_stack([p, np.ones(200)])
     layout = Layout(1, 0, (), 1, (0,))
-    state = State(
-        np.eye(3)[None],
-        np.zeros((1, 3)),
-        np.zeros(6),
-        (gtsam.Pose3(),),
-        np.zeros(1),
-        np.array([[6.0, 0.0, -2.0]]),
-        np.array([[0.0, 0.0, 1.0]]),
-        np.zeros(layout.size),
-    )
+    state = above_ground(layout, np.array([6.0, 0.0, -2.0]))
     nuisances = Nuisances(0.005, 0.003, 0.003, 0.003, np.array([4e-4]), np.array([2e-4]), 2e-4, 0.0)
     tilts = slice(layout.plane, layout.plane + 2)
     for count in (50, 200):
@@ -365,16 +361,7 @@ def test_noise_of_points_says_nothing_of_their_channels(channels: int, each: int
     every, none = np.arange(count), np.zeros(count, np.int64)
     seen = seen_beams(groups, every, every, np.full(count, weight), moments, patches.normal_lidar)
     layout = Layout(1, 0, (), 1, (0,), beams=beams)
-    state = State(
-        np.eye(3)[None],
-        np.zeros((1, 3)),
-        np.zeros(6),
-        (gtsam.Pose3(),),
-        np.zeros(1),
-        np.array([[9.0, 0.0, -height]]),
-        np.array([[0.0, 0.0, 1.0]]),
-        np.zeros(layout.size),
-    )
+    state = above_ground(layout, np.array([9.0, 0.0, -height]))
     points = np.full(count, float(len(channel)))
     sightings = Sightings(
         none, none, moments, of_noise, np.zeros(count), points, state.T_vehicle_lidar, seen

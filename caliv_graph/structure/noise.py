@@ -398,15 +398,15 @@ def beam_sigmas(
         beams: of each LiDAR.
         ranges: what is stated of the ranges.
     """
+    priors = [log_normal(usual * BEAM_SIZES, usual) for usual in ranges.beams]
     sigma = before.copy()
     for _ in range(BEAM_ROUNDS):
         joint = np.asarray(np.linalg.inv(data + mean + np.diag(sigma**-2.0)), dtype=np.float64)
         found = joint @ pull
         after = np.zeros_like(sigma)
         for _, kind, at in parts_of(beams):
-            prior = log_normal(ranges.beams[kind] * BEAM_SIZES, ranges.beams[kind])
             cov, error = joint[at, at], found[at]
-            common = _common_size(cov, error, sigma[at], prior)
+            common = _common_size(cov, error, sigma[at], priors[kind])
             share = np.clip(1.0 - np.diag(cov) / sigma[at] ** 2, 0.0, 1.0)
             variance = (STRIP_FREEDOM * common**2 + error**2) / (STRIP_FREEDOM + share)
             after[at] = np.sqrt(variance)

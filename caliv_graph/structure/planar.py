@@ -316,8 +316,9 @@ def _judged(
     broad = (width[:, 1] > MIN_WIDTH * np.maximum(scatter, 1e-6)) & (tilt < MAX_TILT_RAD)
     spread, bend, skewness, length = _shape(p, group, first, count, centre, axes, width)
     broad &= spread > MIN_SPREAD
-    if channels is not None:
-        several, span = channels.only(chosen).number(first)
+    own = channels and channels.only(chosen)
+    if own is not None:
+        several, span = own.number(first)
         apart = range_m * span / np.maximum(cosine, MIN_INCIDENCE_COS)
         broad &= (several >= MIN_CHANNELS) | (2.0 * apart > MAX_PATCH_M)
     uneven = bend > MAX_BEND_M + 2.0 * scatter / np.sqrt(count)
@@ -328,10 +329,10 @@ def _judged(
     judged = np.zeros(len(points), dtype=bool)
     judged[chosen] = decided[group]
     by_channel = None
-    if channels is not None:
+    if own is not None:
         kept = good[group]
         number = np.cumsum(good) - 1
-        by_channel = channels.only(chosen).only(kept).sums(p[:, kept], number[group[kept]])
+        by_channel = own.only(kept).sums(p[:, kept], number[group[kept]])
     patches = ScanPatches(
         time_s=time_s[good],
         moments=moments[good],

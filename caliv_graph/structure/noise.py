@@ -159,9 +159,7 @@ def tilt_weights(geometry: Geometry, sightings: Sightings, level: BoolArray) -> 
     own = level[sightings.strip]
     if not own.any():
         return out
-    tilts, variances = _tilts(
-        sightings.moments[own], geometry.plain[own], geometry.normals_lidar[own]
-    )
+    tilts, variances = _tilts(sightings, geometry, own)
     common = _common_sigma(tilts.ravel(), variances.ravel(), 1.0)
     out[own] = _falling((np.abs(tilts) / np.sqrt(variances + common**2)).max(axis=1, initial=0.0))
     return out
@@ -173,12 +171,22 @@ def _falling(t: Array) -> Array:
     return np.clip((high - t) / (high - low), 0.0, 1.0)
 
 
-def _tilts(moments: Array, plain: Array, normals_lidar: Array) -> tuple[Array, Array]:
-    """Tilts (Q, 2) of the points of each sighting to their plane, rad; variances by their noise."""
-    N = along_surface(moments, normals_lidar)
-    of_points = np.swapaxes(N, 1, 2) @ moments
-    cov = np.linalg.inv(of_points @ N + np.diag([0.0, STEEPEST_RAD**-2.0, STEEPEST_RAD**-2.0]))
-    fitted = np.einsum("qij,qjk,qk->qi", cov, of_points, plain)
+def _tilts(sightings: Sightings, geometry: Geometry, own: BoolArray) -> tuple[Array, Array]:
+    """Tilts (n, 2) of the points of some sightings to their plane, rad; variances by their noise.
+
+    Without what the noise of the points makes of them: a LiDAR on the bumper has patches of 4 cm
+    that rise by 20 mrad, by noise alone. Two of five lost their weight, and those that were left
+    were the ones whose noise happened to turn them the other way.
+    """
+    moments, noise = sightings.moments[own], sightings.noise[own]
+    N = along_surface(moments, geometry.normals_lidar[own])
+    of_points = np.swapaxes(N, 1, 2)
+    cov = np.linalg.inv(
+        of_points @ moments @ N + np.diag([0.0, STEEPEST_RAD**-2.0, STEEPEST_RAD**-2.0])
+    )
+    told = np.einsum("qij,qj->qi", moments, geometry.plain[own])
+    told -= np.einsum("qij,qj->qi", noise, geometry.placed[own])
+    fitted = np.einsum("qij,qjk,qk->qi", cov, of_points, told)
     return fitted[:, 1:], np.diagonal(cov, axis1=1, axis2=2)[:, 1:]
 
 

@@ -62,7 +62,7 @@ def plan(
         bool,
         typer.Option(
             "--structure/--no-structure",
-            help="Whether walls are used, and the ground cell by cell with them.",
+            help="Whether walls are used, and the ground cell by cell.",
         ),
     ] = True,
     out: Annotated[

@@ -38,9 +38,10 @@ class Assumptions:
         ranges: errors of the ranges that no average removes.
         guesses: LiDAR -> its initial guess, of which the extrinsic plays no part; those that are
             not named have the sigmas of the scenario.
-        structure: whether walls count, and the ground cell by cell with them.
+        structure: whether walls count, and the ground cell by cell.
         stride: for a quick prediction, only every n-th cloud is used, with n-fold weight; of each
-            LiDAR two stay.
+            LiDAR two stay. Ground without walls is then told by the planes of scans, not cell by
+            cell.
     """
 
     ground: Ground = "height"

@@ -203,7 +203,8 @@ def predict_seen(drives: Sequence[SeenDrive], assumptions: Assumptions) -> Predi
     planned = [(of.scenario, of.drive) for of in drives]
     seen, structures = [of.sightings for of in drives], [of.structure for of in drives]
     first = drives[0].scenario
-    by_structure = frozenset().union(*(s.lidars for s in structures if s is not None))
+    # Ground alone places no LiDAR.
+    by_structure = frozenset().union(*(s.lidars for s in structures if s and s.walls.scans))
     lidars = tuple(
         name
         for name in first.lidars
@@ -231,7 +232,7 @@ def predict_seen(drives: Sequence[SeenDrive], assumptions: Assumptions) -> Predi
         names=tuple(scenario.name for scenario, _ in planned),
         covariance=named_prediction(covariance),
         sightings=tuple(seen),
-        walls=tuple(None if s is None else s.walls for s in structures),
+        walls=tuple(s.walls if s and s.walls.scans else None for s in structures),
         space_m=space(planned),
         duration_s=sum(drive.duration_s for _, drive in planned),
         warnings=(

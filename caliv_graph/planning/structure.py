@@ -32,6 +32,7 @@ from caliv_graph.planning.sightings import Sighting, placements, sees_ground
 from caliv_graph.products import Array, IntArray
 from caliv_graph.scenario.drives import Route
 from caliv_graph.scenario.model import Scenario
+from caliv_graph.structure.beams import beam_nodes
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import Problem
 from caliv_graph.structure.solve import Levels, Solved, linearised
@@ -100,12 +101,14 @@ def plan_structure(
     assumptions: Assumptions,
     recorded: RecordedWalls | None = None,
 ) -> PlannedStructure | None:
-    """The structure of a drive; None if it passes no walls, or if none is to be used.
+    """The structure of a drive; None if it passes none, or if none is to be used.
 
-    `recorded` walls replace those of the scenario.
+    `recorded` walls replace those of the scenario. Ground without walls is structure, too, as in
+    `calibrate`; a quick prediction (`Assumptions.stride`) has it from the planes of each scan.
     """
     if not assumptions.structure:
         return None
+    quick = assumptions.stride > 1  # of many candidates: cells take a second each
     names: tuple[str, ...] = (RECORDED_WALLS,)
     if recorded is not None:
         if assumptions.ground == "none":
@@ -114,11 +117,11 @@ def plan_structure(
         face = np.where(recorded.level, GROUND, 0)
     else:
         faces = faces_of(scenario)
-        if not faces.flat.any():
+        if not faces.flat.any() and (quick or assumptions.ground == "none"):
             return None
         patches, face = planned_patches(scenario, drive, faces, assumptions.ground != "none")
         relative, names = np.broadcast_to(np.eye(4), (len(face), 4, 4)), faces.names
-    if not (face != GROUND).any():
+    if not len(face) or (quick and not (face != GROUND).any()):
         return None
     stamps = np.unique(
         np.concatenate([patches.stamps_ns, *(s.stamps_ns[s.used] for s in sightings)])
@@ -152,6 +155,8 @@ def plan_structure(
         ),
         views=views_of(patches, pose_of_scan, prior),
         range_errors=assumptions.ranges,
+        beam_nodes=beam_nodes(patches),
+        bent=True,
     )
     found = linearised(
         problem,
@@ -161,7 +166,8 @@ def plan_structure(
         else recorded.range_sigma_m,
         Levels.first(SIGHTING_M, STRIP_M, SHARED_M, assumptions.ranges)
         if recorded is None
-        else recorded.levels,
+        # Which channels there are depends on the pieces that are used.
+        else replace(recorded.levels, beams=None),
     )
     if found is None:
         return None

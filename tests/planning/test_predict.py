@@ -50,6 +50,7 @@ EXACT = RangeErrors(*[1e-6] * 4)
 
 BOUND = Assumptions(
     ranges=EXACT,
+    structure=False,
     heave_sigma_m=0.0,
     # Of about 300 independent points at 10 m, 50 are left at 24.5 m; SEEN_PART / INDEPENDENT_PART
     # as many points are counted.
@@ -179,8 +180,9 @@ GROUNDS: tuple[Ground, ...] = ("none", "plane", "height")
 
 
 def planned(name: str, ground: Ground, **changes: Any) -> Prediction:
+    """By ground planes; ground cell by cell is tested in test_structure.py."""
     first, *others = DRIVES[name]
-    assumptions = Assumptions(ground=ground, ranges=EXACT)
+    assumptions = Assumptions(ground=ground, ranges=EXACT, structure=False)
     return predict(first, others, replace(assumptions, **changes))
 
 
@@ -216,7 +218,9 @@ def test_null_directions_are_null_without_any_threshold(name: str) -> None:
     first, *others = [noiseless(s) for s in DRIVES[name]]
     for column, ground in enumerate(GROUNDS):
         prediction = predict(
-            first, others, replace(Assumptions(ground=ground, heave_sigma_m=0.0), **exact)
+            first,
+            others,
+            replace(Assumptions(ground=ground, heave_sigma_m=0.0, structure=False), **exact),
         )
 
         sigma = prediction.covariance.uncertainty.spectrum
@@ -273,7 +277,7 @@ def test_scans_at_other_times_see_another_heave() -> None:
         rear = first.lidars["rear"].model_copy(update={"phase_s": phase_s})
         lidars = {**first.lidars, "rear": rear}
         scenarios = [s.model_copy(update={"lidars": lidars}) for s in (first, *others)]
-        assumptions = Assumptions(ground="plane", ranges=EXACT)
+        assumptions = Assumptions(ground="plane", ranges=EXACT, structure=False)
         prediction = predict(scenarios[0], scenarios[1:], assumptions)
         (pair,) = prediction.sigma_s2s.values()
         sigma.append(pair[5])
@@ -349,7 +353,10 @@ def test_turning_and_shifting_the_world_changes_nothing(ground: Ground) -> None:
         }
     )
 
-    one, other = (predict(s, assumptions=Assumptions(ground=ground)) for s in (scenario, moved))
+    one, other = (
+        predict(s, assumptions=Assumptions(ground=ground, structure=False))
+        for s in (scenario, moved)
+    )
 
     for name in one.sigma_s2v:
         assert other.sigma_s2v[name] == pytest.approx(one.sigma_s2v[name], rel=5e-3)

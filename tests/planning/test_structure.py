@@ -369,6 +369,22 @@ def test_the_height_above_strips_and_planes_of_ground_counts_once() -> None:
     assert 0.05 < information**-0.5 < 0.051
 
 
+def test_ground_without_walls_is_told_cell_by_cell() -> None:
+    """As `calibrate` has it: bumps stay where they are, planes of scans take them as independent.
+
+    Calibrations of `paper_arc` claim 0.23 mrad of S2S roll, planes 0.06.
+    """
+    scenario = load_scenario(SCENARIOS / "paper_arc.yaml")
+    cells = predict(scenario)
+    planes = predict(scenario, assumptions=Assumptions(structure=False))
+    roll = AXES.index("roll")
+    by_cells, by_planes = (of.sigma_s2s["front", "rear"][roll] for of in (cells, planes))
+    assert by_cells == pytest.approx(0.22e-3, rel=0.15)
+    assert by_cells > 2.0 * by_planes
+    assert cells.walls == (None,)
+    assert "walls" not in plan_document(Planned(cells, scenario, Assumptions()), {}, False, None)
+
+
 def test_a_clock_beside_walls() -> None:
     timed = predict(DRIVES["S-curve"], assumptions=replace(WALLS_ALONE, time_offset=True))
 

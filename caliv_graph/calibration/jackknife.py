@@ -28,14 +28,14 @@ coordinates of two LiDARs give the scale to a tenth."""
 
 TOGETHER = 2
 """Clouds of a LiDAR in a row that are left out together: neighbours have beams on nearly the same
-spots."""
+spots. One by one where a LiDAR has fewer than three of these for each part."""
 
 ROUNDS = 5
 """Rounds of expectation-maximisation without a part: what is missing of the way to its end is a
 tenth on sparse clouds. Fewer where the scale will not come to 1, below which it does not count."""
 
-LEAST_LIDAR_CLOUDS = 3 * GROUPS * TOGETHER
-"""Clouds of every LiDAR for a jackknife: with fewer the parts are too large."""
+LEAST_LIDAR_CLOUDS = 2 * GROUPS
+"""Clouds of every LiDAR for a jackknife, each of another view: two of each part."""
 
 
 def jackknife_scale(
@@ -56,9 +56,7 @@ def jackknife_scale(
         states: the registration of each placement at the solution; they stay as they are.
         lines: predicted poses of the clouds there.
     """
-    distinct = np.bincount(
-        problem.cloud_lidar, 1.0 / problem.all_views(), minlength=len(problem.lidars)
-    )
+    distinct = _distinct_views(problem)
     if (distinct[distinct > 0.0] < LEAST_LIDAR_CLOUDS).any():
         return 1.0
     # Where the data tell nothing, wide guesses would let the parts wander off along what they do
@@ -96,14 +94,21 @@ def _stays_below_one(scales: Sequence[float]) -> bool:
     return scales[-1] + left * max(scales[-1] - scales[-2], 0.0) < 1.0
 
 
+def _distinct_views(problem: Problem) -> Array:
+    """(n,) different views of each LiDAR: scans of one view count as one."""
+    each = 1.0 / problem.all_views()
+    return np.asarray(np.bincount(problem.cloud_lidar, each, minlength=len(problem.lidars)))
+
+
 def _groups(problem: Problem) -> IntArray:
     """(J,) part that each cloud belongs to: runs of `TOGETHER` clouds of a LiDAR, in turn."""
     out = np.zeros(problem.clouds, dtype=np.int64)
+    few = _distinct_views(problem) < 3 * GROUPS * TOGETHER
     for m in range(problem.placements):
         for a in range(len(problem.lidars)):
             own = np.flatnonzero((problem.cloud_lidar == a) & (problem.cloud_placement == m))
             own = own[np.argsort(problem.cloud_pose[own], kind="stable")]
-            out[own] = np.arange(len(own)) // TOGETHER % GROUPS
+            out[own] = np.arange(len(own)) // (1 if few[a] else TOGETHER) % GROUPS
     return out
 
 

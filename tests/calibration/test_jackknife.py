@@ -48,6 +48,22 @@ def test_neighbouring_clouds_of_a_lidar_are_left_out_together() -> None:
             assert runs[:, 0].tolist() == [n % GROUPS for n in range(len(runs))]
 
 
+def test_clouds_of_a_lidar_with_few_are_left_out_one_by_one() -> None:
+    problem = make_case("front", "rear", count=24).problem
+    kept = (problem.cloud_lidar == 0) | (problem.cloud_pose % 2 == 0)
+    some = replace(
+        problem,
+        cloud_lidar=problem.cloud_lidar[kept],
+        cloud_pose=problem.cloud_pose[kept],
+        cloud_placement=problem.cloud_placement[kept],
+    )
+    group = _groups(some)
+    for lidar, in_a_row in ((0, TOGETHER), (1, 1)):
+        own = np.flatnonzero(some.cloud_lidar == lidar)
+        own = own[np.argsort(some.cloud_pose[own])]
+        assert group[own].tolist() == [n // in_a_row % GROUPS for n in range(len(own))]
+
+
 def test_clouds_are_grouped_in_the_order_of_time() -> None:
     problem = make_case("front", count=24).problem
     order = np.random.default_rng(3).permutation(24)
@@ -193,8 +209,11 @@ def test_a_placement_may_lose_all_its_clouds() -> None:
     assert scale == pytest.approx(chair.scale(), rel=0.2)
 
 
-def test_few_clouds_tell_nothing() -> None:
-    assert seen_chair(LEAST_LIDAR_CLOUDS - 1).scale() == 1.0
+def test_few_clouds_tell_it_too_but_not_very_few() -> None:
+    """22 of 80 clouds on a bumper had a scale of 1; S2S was 3.6 sigmas off, 1.5 with 2.8."""
+    few = 12
+    assert seen_chair(few, shared_m=0.02).scale() > 1.5 * seen_chair(few).scale()
+    assert seen_chair(LEAST_LIDAR_CLOUDS - 1, shared_m=0.02).scale() == 1.0
 
 
 def test_information_along_a_motion_is_that_of_the_joint_quadratic() -> None:

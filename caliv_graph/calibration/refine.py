@@ -234,22 +234,18 @@ class _Loop:
     undetermined: int | None = None
     fine: int = 0
 
-    def linearised(self) -> tuple[_Shapes, Reduced]:
-        """E-step at the poses that the graph predicts, and the graph with its quadratic."""
-        state = self.state
-        lines = linearise_clouds(state.problem, state.values)
-        shapes = _expect(self.states, self.poses_of_clouds(lines), state.turns)
-        begun = time.perf_counter()
-        reduced = self._without_bias(shapes, lines)
-        state.graph_seconds += time.perf_counter() - begun
-        return shapes, reduced
+    def expected(self) -> tuple[_Shapes, CloudLinearisation]:
+        """E-step at the poses that the graph predicts, and the derivatives of these."""
+        lines = linearise_clouds(self.state.problem, self.state.values)
+        return _expect(self.states, self.poses_of_clouds(lines), self.state.turns), lines
 
     def at_the_end(self) -> tuple[_Shapes, Reduced]:
-        """`linearised`, the registration's scale by a jackknife, too."""
-        shapes, reduced = self.linearised()
+        """E-step and linearised graph, the registration's scale by a jackknife, too."""
+        shapes, lines = self.expected()
         begun = time.perf_counter()
-        self.state.least_scale = self.left_out(reduced)
-        reduced = self.scaled(shapes, reduced)
+        self.state.least_scale = self.left_out(lines)
+        self.estimate_scale(shapes, lines)
+        reduced = self.linearised(shapes, lines)
         self.state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced
 
@@ -271,8 +267,7 @@ class _Loop:
             np.concatenate([vehicle_axes_difference(T, T0) for T, T0 in zip(end, now, strict=True)])
             for end in ends
         ]
-        _, reduced = self.linearised()
-        self.state.values = reduced.move(np.mean(steps, axis=0))
+        self.state.values = self.linearised(*self.expected()).move(np.mean(steps, axis=0))
 
     def begin_shapes(self, normals: bool, draw: int = 0) -> None:
         """A new mixture, and if asked for new normals, at these: EM ends near its start."""
@@ -284,23 +279,20 @@ class _Loop:
             shape.by_beams, shape.held_along = True, 0.0
             shape.seed(R, t, FINE_SIGMA_M, draw)
 
-    def left_out(self, reduced: Reduced) -> float:
+    def left_out(self, lines: CloudLinearisation) -> float:
         """Scale of the registration by a jackknife, at a linearisation."""
-        problem = self.state.problem
-        fitting = [T for R, t in self.poses_of_clouds(reduced.lines) for T in unstack(R, t)]
-        lines = replace(reduced.lines, predicted=tuple(fitting))
-        return jackknife_scale(problem, self.extrinsics(), self.states, lines)
+        fitting = [T for R, t in self.poses_of_clouds(lines) for T in unstack(R, t)]
+        moved = replace(lines, predicted=tuple(fitting))
+        return jackknife_scale(self.state.problem, self.extrinsics(), self.states, moved)
 
-    def scaled(self, shapes: _Shapes, reduced: Reduced) -> Reduced:
-        """Estimates the scale of the registration at a linearisation, and applies it to that."""
-        state = self.state
-        clouds, lines = shapes.joint(1.0), reduced.lines
+    def estimate_scale(self, shapes: _Shapes, lines: CloudLinearisation) -> None:
+        """Estimates the scale of the registration at a linearisation."""
+        state, clouds = self.state, shapes.joint(1.0)
         contradicted = fit_scale(state.problem, lines, clouds, state.values, state.noise)
         state.scale = max(1.0, contradicted, state.least_scale)
-        return self._without_bias(shapes, lines)
 
-    def with_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
-        """Estimates the sigmas of the biases at a linearisation, and applies them to that."""
+    def estimate_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> None:
+        """Estimates the sigmas of the biases at a linearisation."""
         reduced = self._reduced(shapes.joint(self.state.scale), lines)
         self.state.bias_sizes = fit_bias_sizes(
             reduced,
@@ -308,12 +300,11 @@ class _Loop:
             reduced.in_tangents(self.prior),
             self.state.config.noise.lidar_range_bias_m,
         )
-        return self._without_bias(shapes, lines)
 
     def _reduced(self, clouds: tuple[Array, Array], lines: CloudLinearisation) -> Reduced:
         return reduce_to_extrinsics(self.state.problem, self.state.values, self.base, clouds, lines)
 
-    def _without_bias(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
+    def linearised(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
         """The graph with the clouds' quadratic; biases of ranges and turns eliminated."""
         joint, directions = shapes.joint(self.state.scale), self.directions(shapes, lines)
         return self._reduced(without_bias(*joint, directions, self._applied(directions)), lines)
@@ -345,16 +336,17 @@ class _Loop:
     def iterate(self, number: int) -> Iteration:
         """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""
         state = self.state
-        shapes, reduced = self.linearised()
+        shapes, lines = self.expected()
         begun = time.perf_counter()
         if all(shape.finest for shape in self.states):
             if self.fine % SCALED_EVERY == 0:
-                reduced = self.scaled(shapes, reduced)
+                self.estimate_scale(shapes, lines)
             self.fine += 1
             if self.fine == BIAS_AFTER:
-                reduced = self.with_bias(shapes, reduced.lines)
+                self.estimate_bias(shapes, lines)
+        reduced = self.linearised(shapes, lines)
         step, lost = self._step(reduced, number)
-        squared = self._squares(shapes, reduced.lines)
+        squared = self._squares(shapes, lines)
         if self.fine >= BIAS_AFTER:
             self._follow(shapes, reduced, step)
         state.values = reduced.move(step)

@@ -7,6 +7,7 @@ which in a turn is a heading error that no bias explains (`README.md`, section 2
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -199,13 +200,16 @@ def _finite_samples(imu: ImuSamples, name: str) -> tuple[IntArray, Array, Array,
 
 
 def _prefix_products(R: Array) -> Array:
-    """(n + 1, 3, 3): identity, R_0, R_0 R_1, ...; by doubling, log2(n) calls of numpy."""
-    out = np.concatenate([np.eye(3)[None], R])
-    shift = 1
-    while shift < len(out):
-        out[shift:] = out[:-shift] @ out[shift:]
-        shift *= 2
-    return np.asarray(out)
+    """(n + 1, 3, 3): identity, R_0, R_0 R_1, ...; two products for each, in sqrt(n) calls twice."""
+    count = len(R) + 1
+    size = math.isqrt(count - 1) + 1
+    out = np.tile(np.eye(3), (size, size, 1, 1))
+    out.reshape(-1, 3, 3)[1:count] = R
+    for i in range(1, size):  # within all blocks at once
+        out[:, i] = out[:, i - 1] @ out[:, i]
+    for i in range(1, size):
+        out[i] = out[i - 1, -1] @ out[i]
+    return np.asarray(out.reshape(-1, 3, 3)[:count])
 
 
 @dataclass(frozen=True)

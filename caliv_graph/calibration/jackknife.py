@@ -19,7 +19,8 @@ from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes, stack
-from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.products import Array, IntArray
+from caliv_graph.registration.moments import Responsibilities
 from caliv_graph.registration.register import JointRegistration
 
 GROUPS = 4
@@ -63,17 +64,18 @@ def jackknife_scale(
     # not determine, and the way is curved.
     usual = np.tile(DEFAULT_GUESS_SIGMAS**-2.0, len(problem.lidars))
     prior = np.maximum(problem.guess_information(), np.diag(usual))
-    group = _groups(problem)
-    every = _placements(problem, extrinsics, states, lines, group >= 0)
+    parts = _parts(problem, states, lines)
+    every = _placements(problem, extrinsics, states, lines, parts)
     H, _ = _system(every, extrinsics)
     known = np.linalg.solve(H + prior, H)
     claimed = float(np.trace(known @ known))
     if claimed <= 1.0:
         return 1.0
-    rests = [
-        _Rest(_placements(problem, extrinsics, states, lines, group != g), extrinsics, prior)
-        for g in range(GROUPS)
-    ]
+    rests = []
+    for g in range(GROUPS):
+        kept = [[part for part in of if part.group != g] for of in parts]
+        placements = _placements(problem, extrinsics, states, lines, kept)
+        rests.append(_Rest(placements, extrinsics, prior))
     scales: list[float] = []
     while len(scales) < ROUNDS and not _stays_below_one(scales):
         ends = np.array([rest.further() for rest in rests])
@@ -113,6 +115,39 @@ def _groups(problem: Problem) -> IntArray:
 
 
 @dataclass(frozen=True)
+class _Part:
+    """The clouds of a placement that are left out together.
+
+    Attributes:
+        group: number of the part.
+        which: (n,) their indices in the placement.
+        expected: their E-step at the solution, where they do not depend on the other clouds.
+    """
+
+    group: int
+    which: IntArray
+    expected: Responsibilities
+
+
+def _parts(
+    problem: Problem, states: Sequence[JointRegistration], lines: CloudLinearisation
+) -> list[list[_Part]]:
+    """The parts of every placement, without those that are empty."""
+    group = _groups(problem)
+    out = []
+    for own, state in zip(problem.clouds_of_placements(), states, strict=True):
+        R, t = stack(lines.predicted[own])
+        of_placement = []
+        for g in range(GROUPS):
+            which = np.flatnonzero(group[own] == g)
+            if len(which):
+                expected = state.only(which).responsibilities(R[which], t[which])
+                of_placement.append(_Part(g, which, expected))
+        out.append(of_placement)
+    return out
+
+
+@dataclass(frozen=True)
 class _Placement:
     """Clouds of a placement, and where the vehicle was.
 
@@ -120,11 +155,13 @@ class _Placement:
         state: their registration, a copy.
         lidar: (J,) index of the LiDAR of each.
         T_target_vehicle: J poses.
+        expected: their E-step at the solution.
     """
 
     state: JointRegistration
     lidar: IntArray
     T_target_vehicle: tuple[gtsam.Pose3, ...]
+    expected: Responsibilities
 
     def poses(self, extrinsics: Sequence[gtsam.Pose3]) -> tuple[Array, Array, Array]:
         """Poses of the clouds (J, 3, 3) and (J, 3), and (J, 6, 6 n) their derivatives.
@@ -146,19 +183,20 @@ def _placements(
     extrinsics: Sequence[gtsam.Pose3],
     states: Sequence[JointRegistration],
     lines: CloudLinearisation,
-    kept: BoolArray,
+    kept: Sequence[Sequence[_Part]],
 ) -> list[_Placement]:
-    """Every placement with those of its clouds that are kept (J,); none without clouds."""
+    """Every placement with those of its parts that are kept; none without clouds."""
     out = []
-    for own, state in zip(problem.clouds_of_placements(), states, strict=True):
-        which = np.flatnonzero(kept[own])
-        if len(which):
+    for own, state, parts in zip(problem.clouds_of_placements(), states, kept, strict=True):
+        if parts:
+            which = np.concatenate([part.which for part in parts])
             lidar = problem.cloud_lidar[own][which]
             T_target_vehicle = tuple(
                 lines.predicted[own.start + j].compose(extrinsics[a].inverse())
                 for j, a in zip(which.tolist(), lidar.tolist(), strict=True)
             )
-            out.append(_Placement(state.only(which), lidar, T_target_vehicle))
+            expected = Responsibilities.joined([part.expected for part in parts])
+            out.append(_Placement(state.only(which), lidar, T_target_vehicle, expected))
     return out
 
 
@@ -173,11 +211,13 @@ class _Rest:
         self, placements: Sequence[_Placement], extrinsics: Sequence[gtsam.Pose3], prior: Array
     ) -> None:
         self._placements, self._moved, self._prior = placements, list(extrinsics), prior
+        self._begun = False
         self.total: Array = np.zeros(len(prior))
 
     def further(self) -> Array:
         """`total` after one more round."""
-        H, gradient = _system(self._placements, self._moved)
+        H, gradient = _system(self._placements, self._moved, at_solution=not self._begun)
+        self._begun = True
         step = -np.asarray(np.linalg.solve(H + self._prior, gradient), np.float64)
         self._moved = [
             retract_vehicle_axes(T, d)
@@ -191,14 +231,18 @@ class _Rest:
 
 
 def _system(
-    placements: Sequence[_Placement], extrinsics: Sequence[gtsam.Pose3]
+    placements: Sequence[_Placement], extrinsics: Sequence[gtsam.Pose3], at_solution: bool = True
 ) -> tuple[Array, Array]:
-    """E-step: (6 n, 6 n) information and (6 n,) gradient over the extrinsics, vehicle axes."""
+    """(6 n, 6 n) information and (6 n,) gradient over the extrinsics, vehicle axes, by an E-step.
+
+    `at_solution`: that of the placements, whose shape and poses are still those of the solution.
+    """
     H = np.zeros((6 * len(extrinsics), 6 * len(extrinsics)))
     gradient = np.zeros(len(H))
     for placement in placements:
         R, t, J = placement.poses(extrinsics)
-        quadratic = placement.state.expect(R, t)
+        who = placement.expected if at_solution else placement.state.responsibilities(R, t)
+        quadratic = placement.state.quadratic(R, t, who)
         H += quadratic.along(J)
         gradient += np.einsum("jab,ja->b", J, quadratic.gradient)
     return H, gradient

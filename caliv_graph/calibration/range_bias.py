@@ -97,32 +97,67 @@ class RangeBiases:
         return np.hstack([*of_lidars, sizes.smooth * self.smooth])
 
 
+@dataclass(frozen=True)
+class OwnRanges:
+    """How biases of its ranges seem to move each of J clouds, in the frame of its LiDAR.
+
+    The same at all poses, while the normals of the points stay.
+
+    Attributes:
+        beams: (J, 3) mean of the unit vectors.
+        radii: (J,) per axis at right angles to these: root mean square distance to the middle.
+        incidence: (J, 6) turn about the middle and motion of it by a metre per
+            1 / cos(incidence) - 1.
+    """
+
+    beams: Array
+    radii: Array
+    incidence: Array
+
+    @classmethod
+    def of(cls, clouds: CloudStack) -> OwnRanges:
+        """Of all clouds of a placement."""
+        beams = clouds.mean_beams
+        views = beams / np.linalg.norm(beams, axis=1)[:, None]
+        along = np.einsum("na,na->n", clouds.centred, views[clouds.cloud])
+        across = clouds.centred - along[:, None] * views[clouds.cloud]
+        # An error of its size there, in the root mean square.
+        radii = np.sqrt(0.5 * clouds.sum_per_cloud((across**2).sum(axis=1)) / clouds.sizes)
+        return cls(beams, radii, _by_incidence(clouds))
+
+
 def range_biases(
-    states: Sequence[JointRegistration], poses: Sequence[tuple[Array, Array]]
+    states: Sequence[JointRegistration],
+    poses: Sequence[tuple[Array, Array]],
+    own: Sequence[OwnRanges] | None = None,
 ) -> RangeBiases:
-    """Of all placements, at `T_target_lidar` (J, 3, 3), (J, 3) of each."""
-    both = [_of_placement(state, R, t) for state, (R, t) in zip(states, poses, strict=True)]
+    """Of all placements, at `T_target_lidar` (J, 3, 3), (J, 3) of each.
+
+    `own` is `OwnRanges` of each, for many poses.
+    """
+    own = [OwnRanges.of(state.clouds) for state in states] if own is None else own
+    each = zip(states, poses, own, strict=True)
+    both = [_of_placement(state, R, t, ranges) for state, (R, t), ranges in each]
     return RangeBiases(
         *(np.asarray(scipy.linalg.block_diag(*kind)) for kind in zip(*both, strict=True))
     )
 
 
-def _of_placement(state: JointRegistration, R: Array, t: Array) -> tuple[Array, Array, Array]:
+def _of_placement(
+    state: JointRegistration, R: Array, t: Array, ranges: OwnRanges
+) -> tuple[Array, Array, Array]:
     """`RangeBiases.offsets`, `.incidence` and `.smooth` of a placement."""
     clouds = state.clouds
-    sizes = clouds.sizes[:, None]
-    beams = clouds.sum_per_cloud(clouds.rotated(R, clouds.beams)) / sizes
+    beams = _turned(R, ranges.beams)
+    each = np.arange(clouds.count)
     offsets = np.zeros((clouds.count, 6, clouds.lidars))
-    offsets[np.arange(clouds.count), 3:, clouds.lidar] = beams
+    offsets[each, 3:, clouds.lidar] = beams
     views = beams / np.linalg.norm(beams, axis=1)[:, None]
-    points = clouds.moved(R, t)
-    middles = clouds.sum_per_cloud(points) / sizes
-    apart = points - middles[clouds.cloud]
-    across = (
-        apart - np.einsum("na,na->n", apart, views[clouds.cloud])[:, None] * views[clouds.cloud]
-    )
-    # Per axis at right angles to the beams: an error of its size there, in the root mean square.
-    radii = np.sqrt(0.5 * clouds.sum_per_cloud((across**2).sum(axis=1)) / clouds.sizes)
+    middles = _turned(R, clouds.centres) + t
+    incidence = np.zeros((clouds.count, 6, clouds.lidars))
+    turn = _turned(R, ranges.incidence[:, :3])
+    incidence[each, :3, clouds.lidar] = turn
+    incidence[each, 3:, clouds.lidar] = _turned(R, ranges.incidence[:, 3:]) + cross(middles, turn)
     roughness = np.sqrt(np.maximum(state.noise.roughness_m2 - LEAST_SIGMA_M**2, 0.0))
     smooth = [np.zeros((clouds.count, 6, 0))]
     for a in np.flatnonzero(roughness > 0.0).tolist():
@@ -130,28 +165,31 @@ def _of_placement(state: JointRegistration, R: Array, t: Array) -> tuple[Array, 
         moves = np.zeros((len(own), 6, 4))
         moves[:, 3:, 0] = views[own]
         tilts = np.eye(3) - views[own, :, None] * views[own, None, :]
-        moves[:, :3, 1:] = tilts / max(float(np.median(radii[own])), LEAST_SIGMA_M)
+        moves[:, :3, 1:] = tilts / max(float(np.median(ranges.radii[own])), LEAST_SIGMA_M)
         moves[:, 3:, 1:] = skew(middles[own]) @ moves[:, :3, 1:]
         root = roughness[a] * _root_of_views(views[own])
         out = np.zeros((clouds.count, 6, 4 * root.shape[1]))
         out[own] = np.einsum("jac,jk->jack", moves, root).reshape(len(own), 6, -1)
         smooth.append(out)
-    kinds = (offsets, _by_incidence(clouds, R, points, middles), np.concatenate(smooth, axis=2))
+    kinds = (offsets, incidence, np.concatenate(smooth, axis=2))
     of_offsets, of_incidence, of_smooth = (of.reshape(6 * clouds.count, -1) for of in kinds)
     return of_offsets, of_incidence, of_smooth
 
 
-def _by_incidence(clouds: CloudStack, R: Array, points: Array, middles: Array) -> Array:
-    """(J, 6, L) how a cloud seems to move by a metre per 1 / cos(incidence) - 1 of its LiDAR.
+def _turned(R: Array, vectors: Array) -> Array:
+    """(J, 3) vectors of the clouds, turned by R (J, 3, 3)."""
+    return np.asarray(np.einsum("jab,jb->ja", R, vectors))
+
+
+def _by_incidence(clouds: CloudStack) -> Array:
+    """`OwnRanges.incidence`.
 
     A range that is too long by that puts its point `1 - cos(incidence)` behind the surface. The
-    motion that explains this best, over all points whose normals are reliable. `points` (N, 3) and
-    their mean per cloud, `middles` (J, 3), are in the target frame.
+    motion that explains this best, over all points whose normals are reliable.
     """
-    normals, own = clouds.rotated(R, clouds.normals), clouds.cloud
-    facing = -np.einsum("na,na->n", normals, clouds.rotated(R, clouds.beams))
+    normals, own, apart = clouds.normals, clouds.cloud, clouds.centred
+    facing = -np.einsum("na,na->n", normals, clouds.beams)
     behind = -(1.0 - np.clip(facing, 0.0, 1.0))
-    apart = points - middles[own]
     radii = np.sqrt(clouds.sum_per_cloud((apart**2).sum(axis=1)) / clouds.sizes)
     radii = np.maximum(radii, LEAST_SIGMA_M)[:, None]
     # Turns in units of the displacement that they are at the radius.
@@ -163,12 +201,7 @@ def _by_incidence(clouds: CloudStack, R: Array, points: Array, middles: Array) -
     shown += ridge[:, None, None] * np.eye(6)
     sums = clouds.sum_per_cloud(weighted * behind[:, None])
     motion = np.linalg.solve(shown, sums[..., None])[..., 0]
-    turn = motion[:, :3] / radii
-    out = np.zeros((clouds.count, 6, clouds.lidars))
-    each = np.arange(clouds.count)
-    out[each, :3, clouds.lidar] = turn
-    out[each, 3:, clouds.lidar] = motion[:, 3:] + cross(middles, turn)
-    return out
+    return np.hstack([motion[:, :3] / radii, motion[:, 3:]])
 
 
 def _root_of_views(views: Array) -> Array:
@@ -222,9 +255,7 @@ def moved_back(
         clouds = state.clouds
         own_m = offsets_m[first : first + clouds.lidars]
         first += clouds.lidars
-        beams = clouds.sum_per_cloud(clouds.beams) / clouds.sizes[:, None]
-        along = np.einsum("jik,jk->ji", R, beams)
-        out.append((R, t - own_m[clouds.lidar][:, None] * along))
+        out.append((R, t - own_m[clouds.lidar][:, None] * _turned(R, clouds.mean_beams)))
     return out
 
 

@@ -23,6 +23,7 @@ from caliv_graph.calibration.pack import packed_solution
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.range_bias import (
     BiasSizes,
+    OwnRanges,
     RangeBiases,
     fit_bias_sizes,
     most_likely_biases,
@@ -223,7 +224,8 @@ class _Loop:
 
     `prior` (6n, 6n) of the guesses; `offsets_m` (B,): biases of the ranges with which
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
-    once it is fixed; `fine`: iterations at the noise level.
+    once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement since the
+    shapes began.
     """
 
     state: SolveState
@@ -233,11 +235,13 @@ class _Loop:
     offsets_m: Array
     undetermined: int | None = None
     fine: int = 0
+    ranges: tuple[OwnRanges, ...] = ()
 
     def expected(self) -> tuple[_Shapes, CloudLinearisation]:
         """E-step at the poses that the graph predicts, and the derivatives of these."""
         lines = linearise_clouds(self.state.problem, self.state.values)
-        return _expect(self.states, self.poses_of_clouds(lines), self.state.turns), lines
+        poses, turns = self.poses_of_clouds(lines), self.state.turns
+        return _expect(self.states, poses, turns, self.ranges), lines
 
     def at_the_end(self) -> tuple[_Shapes, Reduced]:
         """E-step and linearised graph, the registration's scale by a jackknife, too."""
@@ -278,6 +282,7 @@ class _Loop:
                 shape.refine_normals(R, t)
             shape.by_beams, shape.held_along = True, 0.0
             shape.seed(R, t, FINE_SIGMA_M, draw)
+        self.ranges = tuple(OwnRanges.of(shape.clouds) for shape in self.states)
 
     def left_out(self, lines: CloudLinearisation) -> float:
         """Scale of the registration by a jackknife, at a linearisation."""
@@ -404,6 +409,7 @@ def _expect(
     states: Sequence[JointRegistration],
     poses: list[tuple[Array, Array]],
     turns: Sequence[Symmetry | None],
+    ranges: Sequence[OwnRanges],
 ) -> _Shapes:
     """E-step of every placement at the poses that the graph predicts, those of `per_placement`."""
     quadratics = [state.expect(R, t) for state, (R, t) in zip(states, poses, strict=True)]
@@ -411,7 +417,7 @@ def _expect(
         None if turn is None else refit(turn, state.mixture)
         for turn, state in zip(turns, states, strict=True)
     ]
-    return _Shapes(poses, quadratics, fitted, range_biases(states, poses))
+    return _Shapes(poses, quadratics, fitted, range_biases(states, poses, ranges))
 
 
 def per_placement(problem: Problem, lines: CloudLinearisation) -> list[tuple[Array, Array]]:

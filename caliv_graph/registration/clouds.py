@@ -126,6 +126,11 @@ class CloudStack:
         return np.asarray(self.sum_per_cloud(self.points) / self.sizes[:, None])
 
     @cached_property
+    def mean_beams(self) -> Array:
+        """(J, 3) mean of each cloud's unit vectors, lidar frame."""
+        return np.asarray(self.sum_per_cloud(self.beams) / self.sizes[:, None])
+
+    @cached_property
     def features(self) -> Array:
         """(N, 13) what `moments.cell_moments` sums over points, lidar frame.
 

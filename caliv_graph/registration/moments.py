@@ -6,6 +6,7 @@ each cloud. All M-steps are linear in them: matrix products.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +79,23 @@ class Responsibilities:
     component_levers: Array
     slides_m: Array
     heights: HeightSums
+
+    @classmethod
+    def joined(cls, parts: Sequence[Responsibilities]) -> Responsibilities:
+        """Of clouds in a row, from E-steps of some of them each, at the same shape."""
+        along = [part.weight_along for part in parts if part.weight_along is not None]
+        return cls(
+            component=np.concatenate([part.component for part in parts]),
+            weight=np.concatenate([part.weight for part in parts]),
+            weight_along=np.concatenate(along) if along else None,
+            counts=np.sum([part.counts for part in parts], axis=0),
+            explained=np.concatenate([part.explained for part in parts]),
+            inlier_ratio=np.concatenate([part.inlier_ratio for part in parts]),
+            levers=np.concatenate([part.levers for part in parts]),
+            component_levers=np.sum([part.component_levers for part in parts], axis=0),
+            slides_m=np.concatenate([part.slides_m for part in parts]),
+            heights=HeightSums.total([part.heights for part in parts]),
+        )
 
 
 def cell_moments(stack: CloudStack, who: Responsibilities, components: int) -> Array:

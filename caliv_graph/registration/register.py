@@ -25,7 +25,7 @@ from caliv_graph.registration.centring import centre_clouds, depth_of
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
 from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import expect, maximise_shape, seed_mixture
-from caliv_graph.registration.moments import cell_moments
+from caliv_graph.registration.moments import Responsibilities, cell_moments
 from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
 from caliv_graph.registration.starts import best_starts, suspicious
 from caliv_graph.targets.cloud.views import TYPICAL_SHARED, weights_of_views
@@ -181,7 +181,7 @@ class JointRegistration:
         return weights_of_views(self._views, self._shared[self.clouds.lidar])
 
     def only(self, which: IntArray) -> JointRegistration:
-        """The same state with the clouds at these indices, ascending, alone; this one stays."""
+        """The same state with the clouds at these indices alone; this one stays."""
         part = copy(self)
         part.clouds, part.weights = self.clouds.only(which), self.weights[which]
         part._views, part.inlier_ratio = self._views[which], self.inlier_ratio[which]
@@ -211,24 +211,33 @@ class JointRegistration:
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
         """E-step at `T_target_lidar` (R, t), and the quadratic on the poses that follows."""
+        return self.quadratic(R, t, self.responsibilities(R, t))
+
+    def responsibilities(self, R: Array, t: Array) -> Responsibilities:
+        """The E-step alone."""
         self._floor = max(self._floor * ANNEALING, self._floor_end)
-        noise = replace(self.noise, floor_m=0.0 if self.finest else self._floor)
         density = self._gamma / (self._depth_m * (self._gamma + 1.0))
         weights = self.weights * self.view_weights
         by_beams = self.by_beams and self.finest
-        who = expect(
-            self.clouds, R, t, self.mixture, noise, density, weights, self.held_along, by_beams
-        )
+        noise, held = self._noise_now(), self.held_along
+        return expect(self.clouds, R, t, self.mixture, noise, density, weights, held, by_beams)
+
+    def quadratic(self, R: Array, t: Array, who: Responsibilities) -> ShapeQuadratic:
+        """The quadratic on the poses that follows from an E-step at `T_target_lidar` (R, t)."""
         self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
         if self.finest:
             taken_up = quadratic.shape_parameters()
-            self.noise = noise.fitted(who.heights, taken_up, self._configured)
+            self.noise = self._noise_now().fitted(who.heights, taken_up, self._configured)
             self._shared = self.noise.shared_part(who.heights)
         # Not the quadratic itself: it is as large as all the rest.
         self._expected = cells, who.counts, quadratic.turns
         return quadratic
+
+    def _noise_now(self) -> HeightNoise:
+        """The noise of the heights, annealed."""
+        return replace(self.noise, floor_m=0.0 if self.finest else self._floor)
 
     def maximise(self, R: Array, t: Array) -> None:
         """M-step of the components at the new `T_target_lidar` (R, t)."""

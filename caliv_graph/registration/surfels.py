@@ -133,14 +133,16 @@ class Surfels:
 
         At the first each lies behind the plane of the other, at the second before it.
         """
-        heights = self.normals.T @ self.means
-        heights -= np.diag(heights)[:, None]  # of surfel l over the plane of surfel k
-        low = np.minimum(heights, heights.T)
-        high = np.maximum(heights, heights.T)
-        bend = np.maximum(-high, 0.0) - np.maximum(low, 0.0)
         square = np.sum(self.means**2, axis=0)
         apart2 = square + square[:, None] - 2.0 * self.means.T @ self.means
-        return np.where(apart2 < EDGE_REACH_M**2, np.tanh(bend / EDGE_M), 0.0).astype(np.float32)
+        k, other = np.nonzero(apart2 < EDGE_REACH_M**2)
+        heights = self.normals.T @ self.means
+        heights -= np.diag(heights)[:, None]  # of surfel l over the plane of surfel k
+        one, two = heights[k, other], heights[other, k]
+        bend = np.maximum(-np.maximum(one, two), 0.0) - np.maximum(np.minimum(one, two), 0.0)
+        edges = np.zeros(apart2.shape, np.float32)
+        edges[k, other] = np.tanh(bend / EDGE_M)
+        return edges
 
     def _hidden_at_edges(self, found: IntArray, there: Array, slide: Array) -> None:
         """Takes from `there` (k, n) the surfels whose planes the beams meet beyond an edge.

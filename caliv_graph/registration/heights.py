@@ -141,16 +141,18 @@ class HeightSums:
         f2, square, weight = cosine**2, height**2, weight / variance
         steep = weight * f2
 
-        def summed(a: Array, b: Array | None = None, power: int = 1) -> Array:
-            by_point = (a if b is None else a * b).sum(axis=0)
-            return np.asarray(np.bincount(lidar, by_point * cloud_weight**power, lidars))
+        def summed(a: Array, b: Array) -> Array:
+            return np.asarray(np.einsum("kn,kn->n", a, b))
 
-        normal = np.empty((lidars, 2, 2))
-        normal[:, 0, 0] = summed(steep, f2)
-        normal[:, 0, 1] = normal[:, 1, 0] = summed(steep)
-        normal[:, 1, 1] = summed(weight)
-        right = np.column_stack([summed(steep, square), summed(weight, square)])
-        return cls(summed(alpha), summed(alpha, power=2), summed(alpha, f2), normal, right)
+        alphas, steeps, weights = (of.sum(axis=0) for of in (alpha, steep, weight))
+        by_point = [alphas, alphas * cloud_weight, summed(alpha, f2)]
+        by_point += [summed(steep, f2), steeps, steeps, weights]
+        by_point += [summed(steep, square), summed(weight, square)]
+        of_lidars = np.zeros((len(lidar), lidars))
+        of_lidars[np.arange(len(lidar)), lidar] = cloud_weight
+        points, squares, cosine2, *both = np.array(by_point) @ of_lidars
+        normal, right = np.stack(both[:4], axis=1), np.stack(both[4:], axis=1)
+        return cls(points, squares, cosine2, normal.reshape(lidars, 2, 2), right)
 
     @classmethod
     def total(cls, pieces: Sequence[HeightSums]) -> HeightSums:

@@ -113,17 +113,19 @@ class Surfels:
     def nearest_to_beams(self, points: Array, beams: Array, cloud: IntArray) -> IntArray:
         """(n, k) surfels nearest to the beams of points (n, 3) of clouds (n,), ascending."""
         found = np.empty((len(points), min(BEAM_NEIGHBOURS, self.count)), dtype=np.int64)
-        starts = np.append(np.flatnonzero(np.diff(cloud, prepend=-1)), len(cloud)).tolist()
-        for first, end in pairwise(starts):
-            along = beams[first:end].mean(axis=0)
-            along /= np.linalg.norm(along)
-            facing = np.flatnonzero(-(along @ self.normals) > AWAY)
+        starts = np.flatnonzero(np.diff(cloud, prepend=-1))
+        along = np.add.reduceat(beams, starts, axis=0)
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        axes = np.concatenate([tangent_axes(along), along[:, None] / ALONG_BEAM], axis=1)
+        faces = -(along @ self.normals) > AWAY
+        ends = np.append(starts, len(cloud)).tolist()
+        for (first, end), own, seen in zip(pairwise(ends), axes, faces, strict=True):
+            facing = np.flatnonzero(seen)
             if len(facing) < found.shape[1]:
                 facing = np.arange(self.count)
-            axes = np.vstack([tangent_axes(along), along / ALONG_BEAM])
-            places = (axes @ self.means[:, facing]).T
+            places = (own @ self.means[:, facing]).T
             tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
-            near = tree.query(points[first:end] @ axes.T, found.shape[1])[1]
+            near = tree.query(points[first:end] @ own.T, found.shape[1])[1]
             found[first:end] = facing[np.reshape(near, (end - first, -1))]
         return found
 
@@ -156,7 +158,7 @@ class Surfels:
         share = own / (own.sum(axis=0) + BESIDE)
         lost = np.zeros_like(own)
         for k, other in combinations(range(len(own)), 2):
-            edge = self.edges[surfel[k], surfel[other]]
+            edge = self.edges.take(surfel[k] * self.count + surfel[other])
             farther = expit((s[k] - s[other]) / EDGE_M)
             out, hollow = np.maximum(edge, 0.0), np.maximum(-edge, 0.0)
             lost[k] += share[other] * (out * (1.0 - farther) + hollow * farther)

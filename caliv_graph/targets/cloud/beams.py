@@ -51,7 +51,8 @@ class BeamSpacing:
 
 def elevations(points_lidar: Array) -> Array:
     """(n,) radians above the LiDAR's xy plane, of points (n, 3)."""
-    return np.arctan2(points_lidar[:, 2], np.hypot(points_lidar[:, 0], points_lidar[:, 1]))
+    x, y, z = points_lidar.T
+    return np.asarray(np.arctan2(z, np.sqrt(x * x + y * y)))  # `hypot` takes twice as long
 
 
 def typical_gap(values: Array) -> float:

@@ -204,7 +204,13 @@ class RegionExtractor:
         margin = widened_margin_m(self._config, scan.lidar, range_m)
         if self._config.lidars[scan.lidar].fixed:
             margin += self._swept_m(scan)
-        points, near = self._near_region(scan.points_lidar, R, t, margin, tally)
+        offset = scan.points_lidar - R.T @ (self.centre - t)
+        distance2 = np.einsum("ni,ni->n", offset, offset)  # to the middle of the region
+
+        def near_region(margin: float) -> tuple[Array, IntArray]:
+            return self._near_region(scan.points_lidar, distance2, R, t, margin, tally)
+
+        points, near = near_region(margin)
         if len(near) < min(FEWEST_NEAR, extraction.min_points):
             tally.rejected[OUTSIDE] += 1
             return []
@@ -213,7 +219,7 @@ class RegionExtractor:
         around = points
         rings_m = min(RINGS * spacing.row * range_m**2 / LIDAR_HEIGHT_M, FARTHEST_RING_M)
         if rings_m > NEAR_RINGS_M:
-            around, _ = self._near_region(scan.points_lidar, R, t, margin + rings_m, tally)
+            around, _ = near_region(margin + rings_m)
         plane = fit_ground(around, extraction.ground_distance)
         standing = Standing.of(points, near, plane, extraction)
         linking = Linking.of(scan.points_lidar[standing.near], spacing, range_m)
@@ -221,7 +227,7 @@ class RegionExtractor:
         cut_off = [self._reaches_rim(standing.points[g], margin, linking.link_m) for g in groups]
         # By a trusted extrinsic a target is where the region was drawn.
         if any(cut_off) and not self._config.lidars[scan.lidar].fixed:
-            wide = self._near_region(scan.points_lidar, R, t, margin + MAX_EXTENT_M, tally)
+            wide = near_region(margin + MAX_EXTENT_M)
             if plane is None:  # little of it is near the region
                 plane = fit_ground(wide[0], extraction.ground_distance)
             beyond = Standing.of(*wide, plane, extraction)
@@ -287,15 +293,19 @@ class RegionExtractor:
         return 0.5 * float(np.linalg.norm(self._high - self._low))
 
     def _near_region(
-        self, points_lidar: Array, R: Array, t: Array, margin: float, tally: Tally
+        self,
+        points_lidar: Array,
+        distance2: Array,
+        R: Array,
+        t: Array,
+        margin: float,
+        tally: Tally,
     ) -> tuple[Array, IntArray]:
         """Points within `margin` of the region, in its frame, and their indices.
 
-        A ball around the region is tested first: most of a scan is far away.
+        A ball around the region is tested first: most of a scan is far away. `distance2` (N,) are
+        squared distances to the region's middle.
         """
-        centre_lidar = R.T @ (self.centre - t)
-        offset = points_lidar - centre_lidar
-        distance2 = np.einsum("ni,ni->n", offset, offset)
         radius = self.reach_m() + margin
         near = np.flatnonzero(distance2 < radius**2)
         if len(near) == 0:

@@ -44,8 +44,17 @@ within half its period, over which any trajectory is right to 1 mm."""
 class GroundMeter:
     """Measures the ground in the scans of one drive, one at a time."""
 
-    def __init__(self, config: Config, trajectory: VehicleTrajectory, drive: int) -> None:
-        """Binds the initial guesses to the trajectory of a drive."""
+    def __init__(
+        self,
+        config: Config,
+        trajectory: VehicleTrajectory,
+        drive: int,
+        stamps_ns: Collection[int] = (),
+    ) -> None:
+        """Binds the initial guesses to the trajectory of a drive.
+
+        It is asked for all poses at `stamps_ns` at once: a call for one takes as long.
+        """
         self._sigma_range_m = config.noise.lidar_range_m
         self._floors = ground_floors(config.noise)
         self._trajectory = trajectory
@@ -55,6 +64,15 @@ class GroundMeter:
         }
         self._scans: Counter[str] = Counter()
         self._without: dict[str, Counter[str]] = {name: Counter() for name in config.lidars}
+        self._moving = self._moving_at(sorted(stamps_ns))
+
+    def _moving_at(self, stamps_ns: Sequence[int]) -> dict[int, tuple[Array, Array]]:
+        """R_map_vehicle (3, 3) and twist (6,) of the vehicle, by stamp."""
+        if not stamps_ns:
+            return {}
+        R_map_vehicle, _ = self._trajectory.poses_at(stamps_ns)
+        twists = twists_at(self._trajectory, stamps_ns)
+        return dict(zip(stamps_ns, zip(R_map_vehicle, twists, strict=True), strict=True))
 
     def measure(self, scan: LidarScan, at_ns: int | None = None) -> GroundObservation | None:
         """The ground's plane in a scan as it was read; None if there is none.
@@ -67,9 +85,10 @@ class GroundMeter:
         """
         self._scans[scan.lidar] += 1
         at_ns = scan.stamp_ns if at_ns is None else at_ns
-        R_map_vehicle, _ = self._trajectory.poses_at([at_ns])
+        moving = self._moving if at_ns in self._moving else self._moving_at([at_ns])
+        R_map_vehicle, twist = moving[at_ns]
         guess = self._guess[scan.lidar]
-        up_lidar = (R_map_vehicle[0] @ guess.rotation().matrix())[2]
+        up_lidar = (R_map_vehicle @ guess.rotation().matrix())[2]
         # Before the motion compensation, which takes most of the time.
         near = near_points(scan.points_lidar, up_lidar)
         times_s = np.full(len(near), (scan.stamp_ns - at_ns) / NANOSECONDS_PER_SECOND)
@@ -111,8 +130,8 @@ class GroundMeter:
             by_range_bias=changes[:, :biases],
             by_rates=changes[:, biases + 3 :] if times_s.any() else None,
             taken_s=(float(times_s.min()), float(times_s.max())),
-            twist_map=turned_twist(R_map_vehicle[0], twists_at(self._trajectory, [at_ns])[0]),
-            R_map_vehicle=R_map_vehicle[0],
+            twist_map=turned_twist(R_map_vehicle, twist),
+            R_map_vehicle=R_map_vehicle,
         )
 
     def warnings(self) -> tuple[str, ...]:
@@ -204,7 +223,10 @@ def measure_grounds(
             scans = [t for t in recording.scan_stamps_ns(name) if begin <= t <= end]
             wanted.append((drive, name, nearest_scans(of_drive, scans)))
     found: list[GroundObservation] = []
-    meters = [GroundMeter(config, t, drive) for drive, t in enumerate(trajectories)]
+    meters = []
+    for drive, trajectory in enumerate(trajectories):
+        stamps = {at for d, _, pairs in wanted if d == drive for at in pairs.values()}
+        meters.append(GroundMeter(config, trajectory, drive, stamps))
     total = sum(len(pairs) for _, _, pairs in wanted)
     with progress.stage("reading the ground", total) as advance:
         for drive, name, pairs in wanted:

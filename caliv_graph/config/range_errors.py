@@ -167,14 +167,29 @@ def size_weights(
         kinds: (B,) index of the prior that each error's size has.
         priors: of the sizes.
     """
+    if len(priors) == 1:
+        return _weights(_costs(information, pull, priors[0].sigmas) + priors[0].cost)
     cost = np.zeros([len(prior.sigmas) for prior in priors])
     for at in np.ndindex(*cost.shape):
         sizes = np.array([prior.sigmas[i] for prior, i in zip(priors, at, strict=True)])
         sigma = sizes[kinds]
         cost[at] = _cost(sigma[:, None] * information * sigma, sigma * pull)
         cost[at] += sum(prior.cost[i] for prior, i in zip(priors, at, strict=True))
+    return _weights(cost)
+
+
+def _weights(cost: Array) -> Array:
+    """Probabilities from minus their logarithms, up to a constant."""
     weights = np.exp(cost.min() - cost)
     return np.asarray(weights / weights.sum())
+
+
+def _costs(information: Array, pull: Array, sigmas: Array) -> Array:
+    """(n,) `_cost` of errors that have one sigma, at each of some (n,)."""
+    values, axes = np.linalg.eigh(information)
+    variances = sigmas[:, None] ** 2
+    known = 1.0 + variances * values
+    return np.asarray(0.5 * (np.log(known) - variances * (axes.T @ pull) ** 2 / known).sum(axis=1))
 
 
 def _cost(information: Array, pull: Array) -> float:

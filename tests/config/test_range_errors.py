@@ -66,3 +66,15 @@ def test_the_weights_are_those_of_the_pull_under_each_size() -> None:
             likelihood = multivariate_normal(np.zeros(3), A + A @ S @ A).pdf(pull)
             expected[i, j] = likelihood * np.exp(-priors[0].cost[i])
     assert weights == pytest.approx(expected / expected.sum())
+
+
+def test_errors_of_one_size_have_the_weights_of_the_product() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(4, 6))
+    A, pull = root @ root.T, rng.normal(size=4)
+    prior = log_normal(np.array([0.1, 0.5, 2.0]), 1.0)
+    known = flat(np.array([1.0]))  # of no error
+    alone = size_weights(A, pull, np.zeros(4, np.int64), [prior])
+    both = size_weights(A, pull, np.zeros(4, np.int64), [prior, known])
+    assert alone == pytest.approx(both[:, 0])
+    assert alone.min() > 1e-3

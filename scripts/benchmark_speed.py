@@ -41,6 +41,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(REPOSITORY))  # imports the scripts beside this one from any folder
 
 from caliv_graph._open3d import import_open3d
+from caliv_graph.common.memory import keep_freed_memory
 from caliv_graph.common.progress import PlainProgress, Progress, SilentProgress
 from caliv_graph.config.load import dump_config, load_config
 from caliv_graph.config.model import Config
@@ -277,6 +278,7 @@ def profiles_of(
     The last two cast the rays of their clouds while these are read: the room `simulation`.
     """
     import_open3d()
+    keep_freed_memory()  # as the program does
     data = arguments.data.resolve()
     if (data / "input").is_dir():
         config = load_config(authors(data, folder))

@@ -8,12 +8,14 @@ import os
 # share the cores, and threads of its library would wait for each other at ten times the cost.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import gc
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from caliv_graph.common.cores import cores, on_one_core
+from caliv_graph.common.memory import keep_freed_memory
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -73,7 +75,11 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """One thread in each process of pytest-xdist: two would wait for the other processes' cores."""
+    """As the command line does it, in a process of pytest-xdist with one thread.
+
+    Two threads would wait for the cores of the other processes.
+    """
+    keep_freed_memory()
     if hasattr(config, "workerinput"):
         stack = ExitStack()
         stack.enter_context(on_one_core())
@@ -90,3 +96,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if hasattr(config, "workerinput"):  # a process of pytest-xdist
         places = {ROOT / name: place for place, name in enumerate(LONGEST)}
         items.sort(key=lambda item: places.get(item.path, len(places)))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Tests and modules are there to the end: a collection of garbage need not look at them.
+
+    Structure asks for several full collections in each calibration.
+    """
+    gc.collect()
+    gc.freeze()

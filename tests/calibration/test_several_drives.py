@@ -92,8 +92,8 @@ def config(*recordings: SimulatedRecording, use: tuple[str, ...] = ()) -> Config
     raw = config_of(recordings[0], has_bag=True)
     # Of each drive its regions: what is in no region of a drive is nobody's target there.
     raw["target"] = [r for one in recordings for r in config_of(one, has_bag=True)["target"]]
-    raw |= {"registration": {"components": 200, "max_points": 160}}
-    raw["extraction"] = {"max_scans": 16}
+    raw |= {"registration": {"components": 150, "max_points": 120}}
+    raw["extraction"] = {"max_scans": 12}
     raw["require"] = []
     # The simulated errors of the fixes and of the orientation are white: nothing to look for.
     raw["noise"] = raw.get("noise", {}) | {

@@ -25,6 +25,7 @@ from tests.kept import KeptDrive
 SMALL = {
     "registration": {"components": 60, "max_points": 120, "max_iterations": 20},
     "extraction": {"max_scans": 12},
+    "structure": {"use": False},
 }
 """A calibration of a second: millimetres do not count here."""
 

@@ -74,7 +74,7 @@ def test_a_vehicle_that_stands_shows_nothing() -> None:
 @pytest.mark.parametrize("twist", [True, False], ids=["measured-lateral", "no-slip"])
 def test_a_compass_that_counts_from_north_is_told(twist: bool) -> None:
     sensors = replace(Sensors(), yaw_bias_rad=math.radians(80.0))
-    found = compared(Course(eight_drive(31.0)), sensors, 1, twist)
+    found = compared(EIGHT, sensors, 1, twist)
     assert found is not None
     # Orientation and velocities agree with each other: there the fixes tell.
     assert found.yaw_rad == pytest.approx(math.radians(80.0), abs=math.radians(20.0))
@@ -94,7 +94,7 @@ def test_driving_backwards_is_no_disagreement() -> None:
 def test_a_heading_from_north_is_told_before_any_scan_has_a_pose() -> None:
     """Without wanted stamps no covariance is known; its sigma is never zero."""
     sensors = replace(Sensors(), yaw_bias_rad=math.radians(80.0))
-    motion = record(Course(eight_drive(31.0)), sensors, 1)
+    motion = record(EIGHT, sensors, 1)
     found = heading_disagreement(smooth_trajectory(motion, config_for(sensors), ()), motion)
     assert found is not None
     assert found.sigma_rad > 0.0

@@ -195,8 +195,9 @@ def test_from_the_recording_on() -> None:
     raw = config_of(recording, has_bag=True) | {"require": ["s2s", "s2v"]}
     raw["registration"] = QUICK.model_dump()
     progress = SilentProgress()
+    config = without_structure(parse_config(raw, "arc", Path()))
 
-    found = survey([recording], parse_config(raw, "arc", Path()), progress)
+    found = survey([recording], config, progress)
 
     assert found.names == (recording.name,)
     assert set(found.scans) == {("target", "front"), ("target", "rear")}

@@ -24,6 +24,11 @@ def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated arc as a bag, with a config that is ready to run."""
     folder = tmp_path_factory.mktemp("drives") / "arc"
     write_simulated(scenario_of("arc"), folder, 1, output="bag", threads=1)
+    # What the target tells is the subject.
+    config = folder / "config.yaml"
+    raw = yaml.safe_load(config.read_text())
+    raw |= {"structure": {"use": False}, "registration": {"components": 200, "max_points": 160}}
+    config.write_text(yaml.safe_dump(raw))
     return folder
 
 
@@ -68,8 +73,6 @@ def test_zeros_of_a_draft_are_no_guesses(
 def test_in_words_and_with_exit_3_where_the_config_wants_more(arc: Path, tmp_path: Path) -> None:
     raw = yaml.safe_load((arc / "config.yaml").read_text())
     raw |= {"require": ["s2s", "s2v_rotation"], "data": {"path": str(arc / "drive")}}
-    # The words are the subject.
-    raw |= {"structure": {"use": False}, "registration": {"components": 200, "max_points": 160}}
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(raw))
 

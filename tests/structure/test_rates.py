@@ -106,7 +106,7 @@ def test_slow_errors_are_told_where_sweeps_are_put_together(swept: Problem) -> N
 
 def test_noise_of_the_gyroscope_within_sweeps_is_no_error_of_the_extrinsics() -> None:
     """0.2 mrad or so at the ends of the sweeps, in every scan another; three drives at 15 m/s."""
-    count = 40
+    count = 24
     problem = problem_of(yard(), figure_eight(count), 11, NOISE)
     exact, honest = 0.0, 0.0
     for seed in (5, 6, 7):

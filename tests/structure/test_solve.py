@@ -114,7 +114,7 @@ def solved() -> Solved:
 
 def test_a_late_clock_shows_while_it_is_held(solved: Solved) -> None:
     """In curves to both sides no extrinsic makes up for it."""
-    late = solve(problem_of(yard(), figure_eight(24), 1, clock_s=0.02))
+    late = solve(problem_of(yard(), figure_eight(16), 1, clock_s=0.02))
     assert set(late.clocks) == set(solved.clocks) == {"front", "rear"}
     for name, (value_s, sigma_s) in late.clocks.items():
         # One linear step from the wrong extrinsics, on poses 2 m apart.
@@ -123,7 +123,7 @@ def test_a_late_clock_shows_while_it_is_held(solved: Solved) -> None:
         right_s, sigma_s = solved.clocks[name]
         assert abs(right_s) < 4.0 * sigma_s
     # Nothing is held where the offsets are free.
-    free = replace(problem_of(yard(), figure_eight(24), 1, clock_s=0.02), offsets=(0, 1))
+    free = replace(problem_of(yard(), figure_eight(10), 1, clock_s=0.02), offsets=(0, 1))
     accelerations = np.zeros_like(free.twists)
     assert solve(replace(free, accelerations=accelerations)).clocks == {}
 
@@ -159,7 +159,7 @@ def test_the_noise_of_sightings_is_estimated(solved: Solved) -> None:
 def test_the_jitter_of_stamps_is_estimated(solved: Solved) -> None:
     """At 24 m/s a millisecond is 24 mm, and 1.2 mm is less than a sighting's own error."""
     assert solved.nuisances.jitter_s < 5e-5
-    jittering = solve(problem_of(yard(), figure_eight(24), 1, jitter_s=1e-3))
+    jittering = solve(problem_of(yard(), figure_eight(20), 1, jitter_s=1e-3))
     assert jittering.nuisances.jitter_s == pytest.approx(1e-3, rel=0.4)
     assert np.median(jittering.nuisances.sighting) < 1.5 * NOISE.sighting_m
 
@@ -175,7 +175,7 @@ def test_scans_from_one_place_say_more_than_one_and_no_more_than_they_know() -> 
 
     Two places tell what is repeated; where there is one alone, millimetres are taken as repeated.
     """
-    still = (np.zeros((20, 3)), np.zeros(20))
+    still = (np.zeros((12, 3)), np.zeros(12))
     problem = problem_of(yard(), still, 4, Noise(sighting_m=0.0, bias_m=0.0), extrinsics=AHEAD)
     of_lidar = problem.patches.scan_lidar
     alone = solve(replace(problem, views=Views.numbered(of_lidar)))
@@ -190,7 +190,7 @@ def test_scans_from_one_place_say_more_than_one_and_no_more_than_they_know() -> 
     assert np.median(found.nuisances.strip) < 3e-3
     names = zip(found.state.T_vehicle_lidar, AHEAD.values(), strict=True)
     error = np.concatenate([vehicle_axes_difference(T, true) for T, true in names])
-    H = information_of(term_of(found, np.arange(20)), motion_of(found))
+    H = information_of(term_of(found, np.arange(12)), motion_of(found))
     cov = np.linalg.inv(H + np.diag(np.tile(GUESS_SIGMAS**-2.0, 2)))
     turn = np.hstack([np.eye(3), np.zeros((3, 3)), -np.eye(3), np.zeros((3, 3))])
     cov_turn = turn @ cov @ turn.T
@@ -219,7 +219,7 @@ def test_a_term_says_nothing_against_itself(solved: Solved) -> None:
 
 
 def test_another_map_gives_the_same_extrinsics() -> None:
-    problem = problem_of(yard(), figure_eight(16), 2)
+    problem = problem_of(yard(), figure_eight(10), 2)
     first = solve(problem)
     turn = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.array([100.0, -40.0, 7.0]))
     prior = replace(
@@ -241,8 +241,8 @@ PARALLEL = [Wall((0.0, 7.0), -np.pi / 2, 30.0), Wall((0.0, -7.0), np.pi / 2, 30.
 
 def test_between_parallel_walls_what_lies_along_them_is_unknown() -> None:
     """Straight ahead between two fronts: no wall says where along the street a LiDAR is."""
-    found = solve(problem_of(PARALLEL, _straight(24), 3))
-    D = information_of(term_of(found, np.arange(24)), found.problem.prior.information)
+    found = solve(problem_of(PARALLEL, _straight(12), 3))
+    D = information_of(term_of(found, np.arange(12)), found.problem.prior.information)
     along, across = np.zeros(12), np.zeros(12)
     along[3], across[4] = 1.0, 1.0  # x and y of the front LiDAR alone
     assert along @ D @ along < GUESS_SIGMAS[3] ** -2.0

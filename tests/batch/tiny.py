@@ -27,7 +27,7 @@ def tiny_drive(folder: Path, seed: int) -> Path:
     document |= {
         "extraction": {"min_points": 20, "min_scans": 4},
         "ground": {"use": False},
-        "registration": {"components": 120, "max_iterations": 60, "max_points": 150},
+        "registration": {"components": 80, "max_iterations": 30, "max_points": 100},
         "require": [],
         "solve": {"mode": "staged"},
     }

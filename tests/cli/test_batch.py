@@ -213,7 +213,7 @@ def test_drives_and_results_behind_urls(
         assert (out / "mon" / name).read_bytes() == (finished[0] / "mon" / name).read_bytes()
     assert "path" not in yaml.safe_load((out / "mon/config.yaml").read_text())["data"]
     before = records(out)
-    again = batch(manifest, "--out", out.as_uri(), "--workers", 1)
+    again = called("batch", manifest, "--out", out.as_uri())
     assert again.returncode == 0, again.stderr
     assert "1 were done or failed before" in again.stdout or "calibrating" not in again.stdout
     assert records(out) == before

@@ -67,7 +67,17 @@ class Drive:
             if wanted is None or stamp in wanted:
                 yield self.scan(lidar, stamp)
 
+    @cached_property
+    def _kept(self) -> dict[tuple[str, int], LidarScan]:
+        return {}
+
     def scan(self, lidar: str, stamp: int) -> LidarScan:
+        """Drawn once: tests calibrate the same drive many times."""
+        if (lidar, stamp) not in self._kept:
+            self._kept[lidar, stamp] = self._drawn(lidar, stamp)
+        return self._kept[lidar, stamp]
+
+    def _drawn(self, lidar: str, stamp: int) -> LidarScan:
         rng = np.random.default_rng(stamp % 2**31)
         parts = []
         if self.ground and lidar != self.blind:  # dense near the LiDAR, about its own place

@@ -18,7 +18,7 @@ import yaml
 from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.results.names import RESULT_FILES
 from tests.cli.commands import ROOT
-from tests.robustness.hostile_drives import SCENARIO, Outcome, command
+from tests.robustness.hostile_drives import SCENARIO, Outcome, command, write_config
 
 
 def start(*arguments: object, before: Callable[[], None] | None = None) -> subprocess.Popen[str]:
@@ -216,15 +216,16 @@ def test_a_disk_that_fills_up_while_a_result_is_written(
 
 def test_a_disk_that_fills_up_while_a_calibration_is_written(drive: Path, tmp_path: Path) -> None:
     """The report has 5 MB, what comes before it less."""
-    out = tmp_path / "result"
+    out = tmp_path / "results" / "result"
+    config = write_config(drive, tmp_path / "config.yaml", structure={"use": False})
 
-    process = start("calibrate", drive / "config.yaml", "--out", out, before=small_disk(1_000_000))
+    process = start("calibrate", config, "--out", out, before=small_disk(1_000_000))
     _, err = process.communicate(timeout=60)
 
     assert process.returncode == 2
     assert err.startswith(f"error: {out}: cannot be written: File too large")
     assert len(err.splitlines()) == 1
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == [config]
 
 
 def test_a_disk_that_fills_up_while_a_drive_is_simulated(tmp_path: Path) -> None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from caliv_graph.cli import main
 from scripts import _demo
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -30,10 +33,19 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     return _demo.main()
 
 
+def in_this_process(line: Sequence[str | Path], check: bool) -> SimpleNamespace:
+    """Does what `subprocess.run` does with a command, without the imports of a new process."""
+    return SimpleNamespace(returncode=main.run([str(argument) for argument in line[1:]]))
+
+
 @pytest.mark.usefixtures("command")
 def test_the_main_job_is_done_and_explained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    error = subprocess.CalledProcessError
+    monkeypatch.setattr(
+        _demo, "subprocess", SimpleNamespace(run=in_this_process, CalledProcessError=error)
+    )
     out = tmp_path / "out"
     # The arc with a quarter of its clouds.
     scenario = tmp_path / "demo_arc.yaml"

@@ -22,7 +22,7 @@ from scripts._constants_table import CONFIG, CONSTANTS
 from scripts._patched import PACKAGE, Place, UnreachableError, current, patched
 from tests.kept import KeptDrive
 
-SMALL = {
+SMALL: Mapping[str, Mapping[str, Any]] = {
     "registration": {"components": 60, "max_points": 120, "max_iterations": 20},
     "extraction": {"max_scans": 12},
     "structure": {"use": False},

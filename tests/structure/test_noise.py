@@ -10,6 +10,7 @@ import pytest
 from caliv_graph.config.range_errors import UNSTATED
 from caliv_graph.products import Array
 from caliv_graph.structure.beams import (
+    AZIMUTH,
     CHANNEL_KINDS,
     BeamErrors,
     mean_rows,
@@ -69,11 +70,11 @@ def sizes_of(true: Array, usual: Array, shared: Array | float = 0.0) -> Array:
     """(E,) sigmas of errors of one LiDAR, which the data say to a third of their usual size.
 
     And a `shared` error (3,) of each kind, which the data see as errors of all: a bias, or how the
-    LiDAR is turned.
+    LiDAR is turned, of which they know the yaw not at all.
     """
     cov = np.diag((usual / 3.0) ** 2)
-    for _, _, part in parts_of(RANGES):
-        cov[part, part] += (2.0 * usual[part][0]) ** 2
+    for _, kind, part in parts_of(RANGES):
+        cov[part, part] += ((1000.0 if kind == AZIMUTH else 2.0) * usual[part][0]) ** 2
     data = np.asarray(np.linalg.inv(cov), dtype=np.float64)
     J, _ = mean_rows(RANGES, 0, true)
     pull = data @ (true + np.repeat(shared * np.ones(CHANNEL_KINDS), CHANNELS))

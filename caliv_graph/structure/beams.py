@@ -43,10 +43,10 @@ LEAST_BY_CHANNEL = 0.5
 """Share of the patches of a LiDAR, at least, whose points are summed by channel."""
 
 MEANS = {RANGE: 1e-4}
-"""1 sigma of the mean error of all elevations of a LiDAR, by kind, m: that of the ranges is its bias,
-which has a variable of its own. That of the azimuths is a turn of the LiDAR, and left to their
-priors: held at zero, one channel that is thought to be 2.7 mrad off turned the other fifteen and the
-LiDAR by 0.2 mrad (`yardbot` of the second simulator, at a claimed 0.05)."""
+"""1 sigma of the mean error of all elevations of a LiDAR, by kind, m: that of the ranges is its
+bias, which has a variable of its own. That of the azimuths is a turn of the LiDAR, and left to
+their priors: held at zero, one channel that is thought to be 2.7 mrad off turned the other fifteen
+and the LiDAR by 0.2 mrad (`yardbot` of the second simulator, at a claimed 0.05)."""
 
 
 class BeamErrors(NamedTuple):

@@ -29,14 +29,21 @@ coordinates of two LiDARs give the scale to a tenth."""
 
 TOGETHER = 2
 """Clouds of a LiDAR in a row that are left out together: neighbours have beams on nearly the same
-spots. One by one where a LiDAR has fewer than three of these for each part."""
+spots. One by one where a LiDAR has fewer than `MANY_VIEWS`."""
+
+MANY_VIEWS = 3 * GROUPS * TOGETHER
+"""Different views of a LiDAR that give three pairs to each part."""
 
 ROUNDS = 5
 """Rounds of expectation-maximisation without a part: what is missing of the way to its end is a
 tenth on sparse clouds. Fewer where the scale will not come to 1, below which it does not count."""
 
 LEAST_LIDAR_CLOUDS = 2 * GROUPS
-"""Clouds of every LiDAR for a jackknife, each of another view: two of each part."""
+"""Clouds of every LiDAR for a jackknife: two of each part. As many views, too."""
+
+SCANS_OF_A_VIEW = 1.5
+"""Scans of each view at most, in the mean, where a LiDAR has fewer than `MANY_VIEWS`: left out one
+by one, scans of one view are in all parts, and what they share does not show."""
 
 
 def jackknife_scale(
@@ -57,8 +64,7 @@ def jackknife_scale(
         states: the registration of each placement at the solution; they stay as they are.
         lines: predicted poses of the clouds there.
     """
-    distinct = _distinct_views(problem)
-    if (distinct[distinct > 0.0] < LEAST_LIDAR_CLOUDS).any():
+    if not _tell(problem):
         return 1.0
     # Where the data tell nothing, wide guesses would let the parts wander off along what they do
     # not determine, and the way is curved.
@@ -99,18 +105,33 @@ def _stays_below_one(scales: Sequence[float]) -> bool:
 def _distinct_views(problem: Problem) -> Array:
     """(n,) different views of each LiDAR: scans of one view count as one."""
     each = 1.0 / problem.all_views()
-    return np.asarray(np.bincount(problem.cloud_lidar, each, minlength=len(problem.lidars)))
+    distinct = np.bincount(problem.cloud_lidar, each, minlength=len(problem.lidars))
+    return np.asarray(np.round(distinct, 6))  # three thirds are one
+
+
+def _tell(problem: Problem) -> bool:
+    """Whether every LiDAR with clouds has enough of different views for a jackknife."""
+    distinct = _distinct_views(problem)
+    count = np.bincount(problem.cloud_lidar, minlength=len(problem.lidars))
+    few = (distinct >= LEAST_LIDAR_CLOUDS) & (count <= SCANS_OF_A_VIEW * distinct)
+    return bool(((distinct >= MANY_VIEWS) | few)[count > 0].all())
 
 
 def _groups(problem: Problem) -> IntArray:
-    """(J,) part that each cloud belongs to: runs of `TOGETHER` clouds of a LiDAR, in turn."""
+    """(J,) part that each cloud belongs to: runs of `TOGETHER` clouds of a LiDAR, in turn.
+
+    From placement to placement the turn goes on.
+    """
     out = np.zeros(problem.clouds, dtype=np.int64)
-    few = _distinct_views(problem) < 3 * GROUPS * TOGETHER
-    for m in range(problem.placements):
-        for a in range(len(problem.lidars)):
+    in_a_row = np.where(_distinct_views(problem) < MANY_VIEWS, 1, TOGETHER)
+    for a, together in enumerate(in_a_row.tolist()):
+        runs = 0
+        for m in range(problem.placements):
             own = np.flatnonzero((problem.cloud_lidar == a) & (problem.cloud_placement == m))
             own = own[np.argsort(problem.cloud_pose[own], kind="stable")]
-            out[own] = np.arange(len(own)) // (1 if few[a] else TOGETHER) % GROUPS
+            number = runs + np.arange(len(own)) // together
+            out[own] = number % GROUPS
+            runs = int(number.max(initial=runs - 1)) + 1
     return out
 
 

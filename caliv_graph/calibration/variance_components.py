@@ -13,11 +13,7 @@ from scipy.optimize import minimize
 from caliv_graph.products import Array
 
 MAX_STEPS = 100
-"""Of the optimiser; fifteen to thirty do."""
-
-CURVATURES = 30
-"""Steps that the optimiser remembers: a number for each cloud is among the unknowns, and with the
-usual ten it takes 1.7 times as many evaluations."""
+"""Of the optimiser; fifteen to forty do."""
 
 TIME_STEP = 1e-2
 """Change of the logarithm of a correlation time by which its derivative is taken."""
@@ -246,7 +242,6 @@ def maximise(
             "ftol": 1e-10 if exactly else 1e-7,
             "gtol": 1e-3 if exactly else 0.05,
             "maxiter": MAX_STEPS,
-            "maxcor": CURVATURES,
         },
     )
     return np.exp(np.asarray(found.x)), float(found.fun) + first

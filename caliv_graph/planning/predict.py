@@ -2,8 +2,8 @@
 
 No measurement is drawn. The graph that `calibrate` would solve is linearised along the planned
 drive, and everything except the extrinsics is eliminated from its information. Poses, clouds and
-ground form a chain in time whose states share a few coordinates (extrinsics, targets, ground
-plane), so this takes 0.1 s.
+ground planes form a chain in time whose states share a few coordinates (extrinsics, targets, ground
+plane), so this takes 0.1 s; walls, and ground in cells, take one to three.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from caliv_graph.config.model import ExtractionConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError, ConfigError, TargetError
 from caliv_graph.planning.assumptions import Assumptions
-from caliv_graph.planning.information import drive_information, eliminated
+from caliv_graph.planning.information import RIDGE, drive_information, eliminated
 from caliv_graph.planning.recorded_walls import RecordedWalls
 from caliv_graph.planning.sightings import Sighting, placements, sight, thinned
 from caliv_graph.planning.structure import (
@@ -172,7 +172,11 @@ class SeenDrive:
             index = [names.index(name) for name in lidars]
             own = [6 * i + axis for i in index for axis in range(6)]
             own += [6 * len(names) + i for i in index if of.time_offset]
-            return np.asarray(H[np.ix_(own, own)])
+            # A LiDAR that is not planned sees ground, perhaps, and is unknown.
+            rest = np.setdiff1d(np.arange(len(H)), own)
+            H[rest, rest] += RIDGE
+            order = np.concatenate([np.array(own, dtype=np.int64), rest])
+            return eliminated(H[np.ix_(order, order)], len(own))
         if any(len(s.used) for s in self.sightings):
             return drive_information(scenario, drive, self.sightings, lidars, of)
         size = (7 if of.time_offset else 6) * len(lidars)
@@ -204,7 +208,7 @@ def predict_seen(drives: Sequence[SeenDrive], assumptions: Assumptions) -> Predi
     seen, structures = [of.sightings for of in drives], [of.structure for of in drives]
     first = drives[0].scenario
     # Ground alone places no LiDAR.
-    by_structure = frozenset().union(*(s.lidars for s in structures if s and s.walls.scans))
+    by_structure = frozenset(lidar for s in structures if s for _, lidar in s.walls.scans)
     lidars = tuple(
         name
         for name in first.lidars

@@ -27,6 +27,7 @@ from caliv_graph.planning.information import (
 )
 from caliv_graph.planning.motion import PlannedMotion, plan_motion
 from caliv_graph.planning.patches import planned_patches
+from caliv_graph.planning.recorded_route import RecordedRoute
 from caliv_graph.planning.recorded_walls import RecordedWalls
 from caliv_graph.planning.sightings import Sighting, placements, sees_ground
 from caliv_graph.products import Array, IntArray
@@ -86,13 +87,6 @@ class PlannedStructure:
     nodes: IntArray
     walls: SeenWalls
 
-    @property
-    def lidars(self) -> frozenset[str]:
-        """Names of the LiDARs that see any of it."""
-        patches = self.found.problem.patches
-        seen = np.unique(patches.scan_lidar[self.found.sightings.scan])
-        return frozenset(patches.lidars[i] for i in seen.tolist())
-
 
 def plan_structure(
     scenario: Scenario,
@@ -104,11 +98,13 @@ def plan_structure(
     """The structure of a drive; None if it passes none, or if none is to be used.
 
     `recorded` walls replace those of the scenario. Ground without walls is structure, too, as in
-    `calibrate`; a quick prediction (`Assumptions.stride`) has it from the planes of each scan.
+    `calibrate`; a quick prediction (`Assumptions.stride`) has it from the planes of each scan, and
+    so has a recorded drive, of whose ground the slopes are not known.
     """
     if not assumptions.structure:
         return None
-    quick = assumptions.stride > 1  # of many candidates: cells take a second each
+    # Of many candidates: cells take a second each.
+    by_planes = assumptions.stride > 1 or (recorded is None and isinstance(drive, RecordedRoute))
     names: tuple[str, ...] = (RECORDED_WALLS,)
     if recorded is not None:
         if assumptions.ground == "none":
@@ -117,11 +113,11 @@ def plan_structure(
         face = np.where(recorded.level, GROUND, 0)
     else:
         faces = faces_of(scenario)
-        if not faces.flat.any() and (quick or assumptions.ground == "none"):
+        if not faces.flat.any() and (by_planes or assumptions.ground == "none"):
             return None
         patches, face = planned_patches(scenario, drive, faces, assumptions.ground != "none")
         relative, names = np.broadcast_to(np.eye(4), (len(face), 4, 4)), faces.names
-    if not len(face) or (quick and not (face != GROUND).any()):
+    if not len(face) or (by_planes and not (face != GROUND).any()):
         return None
     stamps = np.unique(
         np.concatenate([patches.stamps_ns, *(s.stamps_ns[s.used] for s in sightings)])

@@ -30,8 +30,8 @@ tilted by what these differ, in every scan alike."""
 CHANNEL_KINDS = 3
 """Of one channel: the first three."""
 
-RANGE, AZIMUTH = 0, 2
-"""Which of them are the range and the azimuth."""
+RANGE = 0
+"""Which of them is the range."""
 
 NODES = 16
 """Elevations at most between which the errors of a LiDAR change linearly."""

@@ -176,7 +176,8 @@ def _tilts(sightings: Sightings, geometry: Geometry, own: BoolArray) -> tuple[Ar
 
     Without what the noise of the points makes of them: a LiDAR on the bumper has patches of 4 cm
     that rise by 20 mrad, by noise alone. Two of five lost their weight, and those that were left
-    were the ones whose noise happened to turn them the other way.
+    were the ones whose noise happened to turn them the other way. By the moments as they are,
+    noise included: tilts are too small by its share of these, a seventh for 4 cm and 10 mm.
     """
     moments, noise = sightings.moments[own], sightings.noise[own]
     N = along_surface(moments, geometry.normals_lidar[own])
@@ -427,7 +428,7 @@ def _common_size(cov: Array, error: Array, sigma: Array, prior: SizePrior) -> fl
 
     They are estimated with a covariance (n, n) under their own sigmas (n,), whose ratios stay.
     What is smooth in the elevation says nothing of it: the mean is held at zero or looks like a
-    pitch, and what changes evenly or bends is how ranges err with incidence, heights, or the noise
+    turn, and what changes evenly or bends is how ranges err with incidence, heights, or the noise
     of points that tilts what is seen: known to a few per cent, which passes for channels of 1.5
     mrad where ground is seen by some rings at 70 degrees only (random drive 633: pitch 8 mrad off).
     """

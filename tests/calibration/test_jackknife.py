@@ -18,6 +18,7 @@ from caliv_graph.calibration.jackknife import (
     TOGETHER,
     _groups,
     _stays_below_one,
+    _tell,
     jackknife_scale,
 )
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
@@ -74,6 +75,13 @@ def test_clouds_are_grouped_in_the_order_of_time() -> None:
         cloud_placement=problem.cloud_placement[order],
     )
     np.testing.assert_array_equal(_groups(mixed), _groups(problem)[order])
+
+
+def test_few_clouds_of_several_placements_are_spread_over_the_parts() -> None:
+    problem = make_case("front", count=8).problem
+    for placements in (2, 4, 8):
+        several = replace(problem, cloud_placement=np.arange(8) % placements, placements=placements)
+        assert np.bincount(_groups(several)).tolist() == [2] * GROUPS
 
 
 # ------------------------------------------------------------------ a chair
@@ -175,6 +183,20 @@ def test_clouds_of_few_views_tell_nothing() -> None:
     # That all differ is what no views say.
     every = replace(chair.problem, views=np.ones(CLOUDS))
     assert chair.scale(every) == chair.scale()
+
+
+def test_few_views_of_many_scans_tell_nothing() -> None:
+    """Left out one by one, scans of one view are in every part. Three thirds are one view."""
+    chair = seen_chair()
+    assert chair.scale(replace(chair.problem, views=np.full(CLOUDS, CLOUDS / 8.0))) == 1.0
+    thirds = replace(
+        chair.problem,
+        cloud_lidar=np.zeros(72, np.int64),
+        cloud_pose=np.arange(72),
+        cloud_placement=np.zeros(72, np.int64),
+        views=np.full(72, 3.0),
+    )
+    assert _tell(thirds)
 
 
 def test_clouds_that_are_left_out_have_no_part() -> None:

@@ -385,6 +385,21 @@ def test_ground_without_walls_is_told_cell_by_cell() -> None:
     assert "walls" not in plan_document(Planned(cells, scenario, Assumptions()), {}, False, None)
 
 
+def test_a_lidar_that_sees_ground_alone_is_not_taken_as_known() -> None:
+    """It knows the ground no better than its own mounting; taken as known it halved S2V roll."""
+    scenario = load_scenario(SCENARIOS / "paper_arc.yaml")
+    down = scenario.lidars["rear"].model_copy(update={"vertical_fov_deg": (-60.0, -40.0)})
+    front = scenario.model_copy(update={"lidars": {"front": scenario.lidars["front"]}})
+    both = scenario.model_copy(update={"lidars": {**front.lidars, "rear": down}})
+    grounds: tuple[Ground, ...] = ("plane", "height")
+    for ground in grounds:
+        alone, beside = (predict(s, assumptions=Assumptions(ground=ground)) for s in (front, both))
+        assert (beside.sigma_s2v["front"] > 0.9 * alone.sigma_s2v["front"]).all()
+        assert beside.sigma_s2v["front"][5] > 0.98 * alone.sigma_s2v["front"][5]
+        assert [d.text for d in beside.undetermined] == [d.text for d in alone.undetermined]
+        assert any("never sees a target or a wall" in text for text in beside.warnings)
+
+
 def test_a_clock_beside_walls() -> None:
     timed = predict(DRIVES["S-curve"], assumptions=replace(WALLS_ALONE, time_offset=True))
 

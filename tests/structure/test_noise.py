@@ -10,7 +10,6 @@ import pytest
 from caliv_graph.config.range_errors import UNSTATED
 from caliv_graph.products import Array
 from caliv_graph.structure.beams import (
-    AZIMUTH,
     CHANNEL_KINDS,
     BeamErrors,
     mean_rows,
@@ -63,6 +62,7 @@ def test_what_is_stated_counts_where_there_are_few_patches() -> None:
 
 
 CHANNELS = 32
+OF_AZIMUTH = 2
 RANGES = (BeamErrors(CHANNELS, CHANNEL_KINDS),)
 
 
@@ -74,7 +74,7 @@ def sizes_of(true: Array, usual: Array, shared: Array | float = 0.0) -> Array:
     """
     cov = np.diag((usual / 3.0) ** 2)
     for _, kind, part in parts_of(RANGES):
-        cov[part, part] += ((1000.0 if kind == AZIMUTH else 2.0) * usual[part][0]) ** 2
+        cov[part, part] += ((1000.0 if kind == OF_AZIMUTH else 2.0) * usual[part][0]) ** 2
     data = np.asarray(np.linalg.inv(cov), dtype=np.float64)
     J, _ = mean_rows(RANGES, 0, true)
     pull = data @ (true + np.repeat(shared * np.ones(CHANNEL_KINDS), CHANNELS))

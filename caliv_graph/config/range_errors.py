@@ -163,6 +163,7 @@ def size_weights(
 
     Args:
         information: (B, B) of the errors, everything else eliminated, without their own priors.
+            With one prior of sizes it need not be symmetric and positive to the last digit.
         pull: (B,) minus the gradient of the negative logarithm of the likelihood, at no errors.
         kinds: (B,) index of the prior that each error's size has.
         priors: of the sizes.
@@ -186,7 +187,8 @@ def _weights(cost: Array) -> Array:
 
 def _costs(information: Array, pull: Array, sigmas: Array) -> Array:
     """(n,) `_cost` of errors that have one sigma, at each of some (n,)."""
-    values, axes = np.linalg.eigh(information)
+    values, axes = np.linalg.eigh(0.5 * (information + information.T))
+    values = np.maximum(values, 0.0)
     variances = sigmas[:, None] ** 2
     known = 1.0 + variances * values
     return np.asarray(0.5 * (np.log(known) - variances * (axes.T @ pull) ** 2 / known).sum(axis=1))

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 from scipy.optimize import nnls
 
@@ -344,7 +342,7 @@ def _bias_sigma(
     unit = np.zeros((layout.size, len(own)))
     unit[own, np.arange(len(own))] = 1.0
     known = np.linalg.inv(solve(unit)[own])
-    information = _positive(known - before**-2.0 * np.eye(len(own)))
+    information = known - before**-2.0 * np.eye(len(own))
     kinds = np.zeros(len(own), dtype=np.int64)
     prior = ranges.offsets
     weights = size_weights(information, known @ errors[own], kinds, [prior])
@@ -439,16 +437,10 @@ def _common_size(cov: Array, error: Array, sigma: Array, prior: SizePrior) -> fl
     if not free.shape[1]:
         return prior.usual
     by = shape[:, None] * free
-    information = _positive(by.T @ (known - np.diag(sigma**-2.0)) @ by)
+    information = by.T @ (known - np.diag(sigma**-2.0)) @ by
     kinds = np.zeros(free.shape[1], dtype=np.int64)
     weights = size_weights(information, by.T @ (known @ error), kinds, [prior])
     return math.sqrt(float(weights @ prior.sigmas**2))
-
-
-def _positive(information: npt.NDArray[Any]) -> Array:
-    """A symmetric matrix that is positive semidefinite but for rounding."""
-    values, axes = np.linalg.eigh(0.5 * (information + information.T))
-    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)
 
 
 def _strip_sigmas(

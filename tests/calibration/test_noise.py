@@ -153,7 +153,7 @@ def test_poses_that_wander_are_seen_to_wander(seed: int) -> None:
 
 def typical_ratios(true: PoseNoise) -> tuple[float, float]:
     """Geometric means over seeds of what was found over what was drawn: white, slow."""
-    found = [fitted(true, seed)[0] for seed in range(3)]
+    found = [fitted(true, seed)[0] for seed in range(5)]
     white = np.log([white_m(f) / white_m(true) for f in found])
     drift = np.log([drift_m(f) / drift_m(true) for f in found])
     return float(np.exp(white.mean())), float(np.exp(drift.mean()))

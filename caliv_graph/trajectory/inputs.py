@@ -67,6 +67,7 @@ class SmootherInput:
         wheels: what is known of the axle where there is no IMU; `T_vehicle_imu` is then that of its
             frame, `inertial` and `noise` are of `wheels.wheel_samples`, and gravity is zero.
         slope: (2,) of the mean ground along the map's x and y, where there is no IMU.
+        axle_slip: side slip of the axle there, radians per m/s^2 of lateral acceleration.
         speed_scale: measured over true velocities.
         speed_point: (2,) y and z in the vehicle frame, metres, of where wheels beside an IMU
             measure the speed.
@@ -92,6 +93,7 @@ class SmootherInput:
     scales: Mapping[str, float] = field(default_factory=dict)
     wheels: WheelModel | None = None
     slope: Array = field(default_factory=lambda: np.zeros(2))
+    axle_slip: float = 0.0
     speed_scale: float = 1.0
     speed_point: Array = field(default_factory=lambda: np.zeros(2))
     headings: Headings | None = None

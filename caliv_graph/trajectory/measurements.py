@@ -193,12 +193,14 @@ def velocities_at_nodes(
     T_twist_imu: gtsam.Pose3,
     scale: float = 1.0,
     late_ns: int = 0,
+    slip_s2_m: float = 0.0,
 ) -> NodeVelocities | None:
     """Averages the velocities around each node; None if there are none.
 
     They are those of the origin of the twist's frame, mostly the vehicle's; `scale` is measured
     over true ones, `late_ns` the stamps less the true times. The lever to the IMU enters with the
-    gyroscope's rate and its noise.
+    gyroscope's rate and its noise. `slip_s2_m` is the side slip of an axle, radians per m/s^2 of
+    lateral acceleration, to the outside of a curve.
     """
     usable = np.isfinite(twist.velocity).all(axis=1)
     usable &= (twist.stamps_ns >= nodes_ns[0]) & (twist.stamps_ns <= nodes_ns[-1])
@@ -211,7 +213,11 @@ def velocities_at_nodes(
     R_imu_twist = T_imu_twist.rotation().matrix()
     arm = T_imu_twist.translation()
     rates = interpolate(stamps, dead.stamps_ns, dead.gyro)
-    at_imu = twist.velocity[usable] @ R_imu_twist.T - scale * cross(rates, arm)
+    measured = twist.velocity[usable]
+    if slip_s2_m:
+        measured = measured.copy()
+        measured[:, 1] -= slip_s2_m * measured[:, 0] ** 2 * (rates @ R_imu_twist)[:, 2]
+    at_imu = measured @ R_imu_twist.T - scale * cross(rates, arm)
     sample_s = float(np.median(np.diff(dead.stamps_ns))) * 1e-9
     arm_cross = np.cross(np.eye(3), arm)
     arm_cov = arm_cross.T @ (noise.gyro_density / sample_s) @ arm_cross

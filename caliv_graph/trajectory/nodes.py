@@ -98,6 +98,7 @@ def carry_to_nodes(
             data.T_vehicle_twist.between(data.T_vehicle_imu),
             data.speed_scale,
             0 if data.wheels is None else imu_late,
+            data.axle_slip,
         )
     headings = baselines = None
     if data.headings is not None and "heading" in kinds:

@@ -108,6 +108,10 @@ def _slope_moved(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, slope=data.slope + d)
 
 
+def _slip_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, axle_slip=data.axle_slip + float(d[0]))
+
+
 def _scale_moved(data: SmootherInput, d: Array) -> SmootherInput:
     scale = data.speed_scale + float(d[0])
     noise = data.noise
@@ -160,6 +164,12 @@ SLOPE = InputParameter(
     "wheels.slope", ("x", "y"), "rad", np.full(2, 1e-3), frozenset({"level"}), _slope_moved
 )
 """Of the mean ground of a drive, along the map's axes."""
+
+AXLE_SLIP = InputParameter(
+    "wheels.slip", ("value",), "s^2/m", np.full(1, 1e-3), frozenset({"velocity"}), _slip_moved
+)
+"""Side slip of an axle per lateral acceleration, to the outside of a curve: how soft its tyres are.
+At a constant speed it is as if the axle were `slip v^2` ahead of where it is."""
 
 SPEED_SCALE = InputParameter(
     "twist.scale", ("value",), "", np.full(1, 1e-3), frozenset({"velocity"}), _scale_moved

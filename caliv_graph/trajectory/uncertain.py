@@ -22,6 +22,7 @@ from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import node_ordering
 from caliv_graph.trajectory.parameters import (
+    AXLE_SLIP,
     GNSS_TIME_OFFSET,
     HEADING_YAW,
     IMU_PLACE,
@@ -51,6 +52,10 @@ SPEED_POINT_SIGMAS = (0.1, 0.5)
 """1 sigma of it, metres, beside the vehicle's x axis. The body pitches about a point half a metre
 above the axle on which the wheels roll; wheels of one side, or of other radii, measure a part of
 the turn."""
+
+AXLE_SLIP_SIGMA = 0.005
+"""1 sigma of the side slip of an axle, radians per m/s^2: tyres of a passenger car let its rear
+axle slip by 2 to 4 degrees per g."""
 
 SYNCHRONISED_S = 1e-4
 """1 sigma of a synchronised clock: PPS and PTP are below, NTP on a local network is about there.
@@ -114,6 +119,8 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
     if data.wheels is not None:
         slope = np.full(2, np.radians(wheels.slope_sigma_deg))
         out.append(UncertainParameter(SLOPE, slope, np.zeros(2)))
+        if data.wheels.planar:
+            out.append(UncertainParameter(AXLE_SLIP, np.full(1, AXLE_SLIP_SIGMA), np.zeros(1)))
     scale = data.speed_scale_sigma
     if scale is not None and data.motion.twist is not None:
         out.append(UncertainParameter(speed_scale(data), np.full(1, scale), np.zeros(1)))

@@ -33,6 +33,7 @@ from caliv_graph.trajectory.correlated import (
 )
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.parameters import (
+    AXLE_SLIP,
     GNSS_TIME_OFFSET,
     HEADING_YAW,
     LEVER_ARM,
@@ -137,6 +138,7 @@ def estimated_scales(
     if data.motion.twist is not None and data.speed_scale_sigma:
         typed.append(speed_scale(data))
     typed += [SPEED_POINT] if data.speed_alone else []
+    typed += [AXLE_SLIP] if data.wheels is not None and data.wheels.planar else []
     typed += [HEADING_YAW] if data.headings is not None else []
     typed += [SECOND_ARM] if data.baselines is not None else []
     columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)

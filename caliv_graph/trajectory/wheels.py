@@ -1,9 +1,9 @@
 """Wheel odometry as the source of the motion between fixes, where there is no IMU.
 
 The axle's frame stands in for that of an IMU: x where the vehicle goes, z normal to the road. Its
-yaw rate is that of the odometry, or unknown; its other rates are zero but for the bumps of the
-road; its acceleration in its own axes changes slowly (`README.md`, section 15). So an arc at
-constant speed is what no noise explains: constant twist.
+yaw rate is that of the odometry, or unknown; its roll and pitch change as smoothly as springs let
+them, about the road's level; its acceleration in its own axes changes slowly (`README.md`, section
+15). So an arc at constant speed is what no noise explains: constant twist.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ ACCELERATION_M_S2 = 3.0
 VIBRATION_M_S2 = 0.02
 """m/s^2/sqrt(Hz), white acceleration: what shakes faster than the nodes."""
 
-# What makes rates about x and y, of which nothing but the bumps is known, regular: far below these.
 STEADY_RAD_S = 1e-4
-STEADY_RAD_S2 = 1e-5
+"""rad/s/sqrt(Hz), white rates about x and y. They make the step of a rate that changes regular: far
+below what changes it."""
 
 LEAST_SLIP_M_S = 0.003
 """1 sigma of the lateral and vertical velocity of a standing vehicle."""
@@ -150,8 +150,8 @@ def wheel_samples(twist: TwistSamples, name: str) -> tuple[Inertial, tuple[str, 
 def wheel_noise(twist: TwistSamples, config: Config) -> ImuNoise:
     """The noise of `wheel_samples`, and the walks of what they do not measure."""
     model, noise = wheel_model(twist, config), config.noise
-    # White rates and a white pull to level make roll and pitch a stationary Gauss-Markov process.
-    bumps = 2.0 * model.tilt_rad**2 / model.correlation_s
+    T = model.correlation_s
+    rolling, rolling_walk = math.sqrt(2.0) * model.tilt_rad / T, tilt_walk(model)
     sources = {"roll and pitch": "wheels.tilt_sigma_deg", "braking": "a usual drive"}
     yaw, bias, walk = STEADY_RAD_S**2, TURNING_RAD_S, STEERING_RAD_S2
     if not model.yaw_rate:
@@ -162,11 +162,11 @@ def wheel_noise(twist: TwistSamples, config: Config) -> ImuNoise:
         yaw, bias = sigma**2 * dt, noise.gyroscope_bias_rad_s
         walk = noise.gyroscope_bias_walk_rad_s2_sqrthz or YAW_RATE_WALK_RAD_S2
     return ImuNoise(
-        gyro_density=np.diag([bumps, bumps, yaw]),
+        gyro_density=np.diag([STEADY_RAD_S**2, STEADY_RAD_S**2, yaw]),
         force_density=VIBRATION_M_S2**2 * np.eye(3),
-        gyro_walk=np.array([STEADY_RAD_S2, STEADY_RAD_S2, walk]),
+        gyro_walk=np.array([rolling_walk, rolling_walk, walk]),
         force_walk=np.array(JERK_M_S3),
-        gyro_bias=np.array([STEADY_RAD_S, STEADY_RAD_S, bias]),
+        gyro_bias=np.array([rolling, rolling, bias]),
         force_bias=np.full(3, ACCELERATION_M_S2),
         sources=sources,
     )
@@ -220,11 +220,19 @@ def node_spans_s(nodes_ns: IntArray) -> Array:
     return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)), np.float64)
 
 
+def tilt_walk(model: WheelModel) -> float:
+    """rad/s^2/sqrt(Hz), random walk of the rates about x and y of a body on its springs.
+
+    Of variance s^2 and integral time T of roll and pitch, with `level_sigmas`.
+    """
+    return math.sqrt(8.0 / model.correlation_s**3) * model.tilt_rad
+
+
 def level_sigmas(nodes_ns: IntArray, model: WheelModel) -> Array:
     """(n,) 1 sigma of `level_factor` at the nodes, radians.
 
-    With white rates of density `2 s^2 / T` the pull to level makes roll and pitch a process of
-    variance s^2 and correlation time T: its information is a chain of neighbours.
+    With rates that walk (`tilt_walk`) the pull to level makes roll and pitch a process of variance
+    s^2 and integral time T that has a rate: its information is a chain.
     """
     density = 2.0 * model.tilt_rad**2 * model.correlation_s
     return np.asarray(np.sqrt(density / node_spans_s(nodes_ns)))

@@ -22,8 +22,8 @@ from caliv_graph.trajectory.parameters import SPEED_POINT
 from caliv_graph.trajectory.physics import motion_physics
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.uncertain import AXLE_SLIP_SIGMA
 from caliv_graph.trajectory.wheels import (
-    WheelModel,
     level_sigmas,
     node_spans_s,
     wheel_model,
@@ -110,6 +110,27 @@ def beside_imu(seed: int, point_m: float = 0.0) -> MotionData:
     velocity = motion.twist.velocity.copy()
     velocity[:, 0] -= SCALE * point_m * turn
     return replace(motion, imu=inertial.imu, twist=replace(motion.twist, velocity=velocity))
+
+
+def test_an_axle_that_slips_in_curves_is_no_axle_elsewhere() -> None:
+    # At 2 m/s an axle that slips by 8 mrad per m/s^2 goes as one 32 mm ahead of it would: an
+    # antenna that is as much farther ahead of the first.
+    softness, speed_m_s = 0.008, 2.0
+    x, y, z = ANTENNA.lever_arm
+    found = []
+    for ahead_m in (0.0, softness * speed_m_s**2):
+        antenna = replace(ANTENNA, lever_arm=(x + ahead_m, y, z))
+        known = {"tilt_sigma_deg": 0.1, "slip_sigma_deg": 0.1, "rotation_sigma_deg": 0.01}
+        config = config_for(antenna, wheels=known)
+        found.append(smooth_trajectory(wheels(1), config, stamps(DRIVE.duration_s, 5.0, 0.05)))
+    sigmas = found[1].sigmas_of("wheels.slip")
+    assert sigmas is not None
+    # What the drive tells of it, the rest is the prior's zero.
+    told = 1.0 - (sigmas[0] / AXLE_SLIP_SIGMA) ** 2
+    slips = [each.data.axle_slip for each in found]
+    assert told > 0.25
+    assert slips[1] - slips[0] == pytest.approx(told * softness, rel=0.2)
+    assert abs(slips[0]) < 2.0 * sigmas[0]
 
 
 def test_with_an_imu_scale_and_place_of_the_speed_are_found() -> None:
@@ -275,23 +296,26 @@ def test_poses_within_a_sweep_follow_the_turn() -> None:
 
 
 def test_roll_and_pitch_are_a_stationary_process() -> None:
-    # White rates and a pull to level, as in the graph, against cov = s^2 exp(-|dt| / T).
-    model = WheelModel(True, True, slip_rad=1e-3, tilt_rad=4e-3, correlation_s=1.0)
-    nodes = START_NS + np.arange(0, 12_000_000_000, 50_000_000)
+    # Rates that walk and a pull to level, as in the graph: the covariance is
+    # s^2 exp(-a) (cos a + sin a), a = |dt| / T.
     config = settings()
     twist = wheels(1).twist
     assert twist is not None
-    density = wheel_noise(twist, config).gyro_density[0, 0]
-    density *= (model.tilt_rad / np.radians(config.wheels.tilt_sigma_deg)) ** 2
-    steps = np.diff(nodes) * 1e-9
-    difference = np.diff(np.eye(len(nodes)), axis=0)
-    information = difference.T @ np.diag(1.0 / (density * steps)) @ difference
+    model, noise = wheel_model(twist, config), wheel_noise(twist, config)
+    step_s, variance = 0.05, model.tilt_rad**2
+    nodes = START_NS + np.arange(0, 12_000_000_000, round(step_s * 1e9))
+    change = np.diff(np.eye(len(nodes)), n=2, axis=0) / step_s
+    information = change.T @ change / (noise.gyro_walk[0] ** 2 * step_s)
     information += np.diag(level_sigmas(nodes, model) ** -2)
     cov = np.linalg.inv(information)
-    middle = len(nodes) // 2
-    assert cov[middle, middle] == pytest.approx(model.tilt_rad**2, rel=0.02)
-    assert cov[middle, middle + 20] == pytest.approx(model.tilt_rad**2 * np.exp(-1.0), rel=0.03)
-    assert node_spans_s(nodes).sum() == pytest.approx(steps.sum())
+    middle, later = len(nodes) // 2, round(model.correlation_s / step_s)
+    assert cov[middle, middle] == pytest.approx(variance, rel=0.02)
+    after = variance * np.exp(-1.0) * (np.cos(1.0) + np.sin(1.0))
+    assert cov[middle, middle + later] == pytest.approx(after, rel=0.03)
+    rates = np.diff(np.eye(len(nodes)), axis=0) / step_s
+    rate = np.sqrt((rates @ cov @ rates.T)[middle, middle])
+    assert rate == pytest.approx(noise.gyro_bias[0], rel=0.03)
+    assert node_spans_s(nodes).sum() == pytest.approx((nodes[-1] - nodes[0]) * 1e-9)
 
 
 def test_what_wheels_cannot_tell_is_said() -> None:

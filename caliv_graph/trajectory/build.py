@@ -25,12 +25,12 @@ from caliv_graph.trajectory.factors import (
     position_factor,
     velocity_factor,
 )
-from caliv_graph.trajectory.imu import preintegrate
+from caliv_graph.trajectory.imu import DeadReckoning, preintegrate
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.measurements import NodeOrientations, NodePositions, NodeVelocities
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.states import States, without_bias
-from caliv_graph.trajectory.wheels import level_sigmas, normal_of
+from caliv_graph.trajectory.wheels import accelerations, level_sigmas, normal_of
 
 GAUGE_M = 1e-4
 GAUGE_RAD = 1e-4
@@ -94,7 +94,7 @@ def build_graph(
     if carried.baselines is not None:
         _add_baselines(graph, data, carried.baselines, kernel)
     if data.wheels is not None and "level" in kinds:
-        _add_level(graph, data, nodes)
+        _add_level(graph, data, nodes, dead)
     if data.positions is None:
         _add_gauge_prior(graph, data, states)
     return graph if kinds == KINDS else graph.only(kinds)
@@ -229,13 +229,17 @@ def _robust(
     )
 
 
-def _add_level(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray) -> None:
-    """The road under an axle is level, but for its slope and bumps."""
+def _add_level(
+    graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray, dead: DeadReckoning
+) -> None:
+    """The road under an axle is level, but for its slope and bumps; the body leans in curves."""
     assert data.wheels is not None
+    assert data.motion.twist is not None
     up_map = normal_of(data.slope)
+    leaning = data.lean * accelerations(data.motion.twist, nodes, dead)
     for i, sigma in enumerate(level_sigmas(nodes, data.wheels).tolist()):
         noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
-        graph.add("level", level_factor(key_imu(i), up_map, noise))
+        graph.add("level", level_factor(key_imu(i), up_map, leaning[i], noise))
 
 
 def _add_gauge_prior(graph: TrajectoryGraph, data: SmootherInput, states: States) -> None:

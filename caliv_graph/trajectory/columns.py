@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
 
+from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate, TrajectoryGraph, build_graph, from_values
 from caliv_graph.trajectory.factors import position_residuals, velocity_residuals
-from caliv_graph.trajectory.imu import DeadReckoning, log_so3
+from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.parameters import InputParameter
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.states import States, without_bias
+from caliv_graph.trajectory.wheels import normal_of
 
 
 def parameter_columns(
@@ -185,6 +187,18 @@ class _Residuals:
         return out
 
     @cached_property
+    def _level(self) -> States:
+        """The states, with z of the axle's frame along the normal of the mean ground.
+
+        Without an IMU it is the fixes that tell roll and pitch, with their noise. Turned by them,
+        the arm of an antenna would be told by that noise: one that is longer explains more of it.
+        """
+        R = self._at.R_map_imu
+        normal = normal_of(self._data.slope)
+        turn = cross(R[:, :, 2], np.broadcast_to(normal, (len(R), 3)))
+        return replace(self._at, R_map_imu=exp_so3(turn) @ R)
+
+    @cached_property
     def _dead(self) -> DeadReckoning:
         return without_bias(self._data.inertial, self._nodes, self._states)
 
@@ -205,7 +219,7 @@ class _Residuals:
             return np.zeros((0, 3))
         keep = ~np.isin(carried.fixes, self._dropped)
         return position_residuals(
-            self._at,
+            self._at if moved.wheels is None else self._level,
             carried.nodes[keep],
             carried.position_map[keep],
             carried.offset_imu[keep],

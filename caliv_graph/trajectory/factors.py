@@ -193,10 +193,13 @@ def orientation_factor(
     return gtsam.PoseRotationPrior3D(key_imu, R_map_imu, noise)
 
 
-def level_factor(key_imu: int, up_map: Array, noise: NoiseModel) -> gtsam.CustomFactor:
-    """Level ground under the frame: `r = (R^T n)_xy`, n = `up_map` (3,) its normal in the map.
+def level_factor(
+    key_imu: int, up_map: Array, leaning_rad: Array, noise: NoiseModel
+) -> gtsam.CustomFactor:
+    """Level ground under the frame: `r = (R^T n)_xy - l`, n = `up_map` (3,) its normal in the map.
 
-    Nose up is positive x, left side up positive y, radians; `noise` has the 2 dimensions of r.
+    Nose up is positive x, left side up positive y, radians. l = `leaning_rad` (2,) is how the body
+    leans on its springs; `noise` has the 2 dimensions of r.
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -205,7 +208,7 @@ def level_factor(key_imu: int, up_map: Array, noise: NoiseModel) -> gtsam.Custom
             J = np.zeros((2, 6))
             J[:, :3] = skew(up)[:2]
             jacobians[0] = J
-        return np.asarray(up[:2])
+        return np.asarray(up[:2] - leaning_rad)
 
     return gtsam.CustomFactor(noise, [key_imu], error)
 

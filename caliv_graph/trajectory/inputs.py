@@ -68,6 +68,8 @@ class SmootherInput:
             frame, `inertial` and `noise` are of `wheels.wheel_samples`, and gravity is zero.
         slope: (2,) of the mean ground along the map's x and y, where there is no IMU.
         axle_slip: side slip of the axle there, radians per m/s^2 of lateral acceleration.
+        lean: (2,) how the body leans on its springs there: nose up per m/s^2 ahead, left side up
+            per m/s^2 to the left, radians.
         speed_scale: measured over true velocities.
         speed_point: (2,) y and z in the vehicle frame, metres, of where wheels beside an IMU
             measure the speed.
@@ -94,6 +96,7 @@ class SmootherInput:
     wheels: WheelModel | None = None
     slope: Array = field(default_factory=lambda: np.zeros(2))
     axle_slip: float = 0.0
+    lean: Array = field(default_factory=lambda: np.zeros(2))
     speed_scale: float = 1.0
     speed_point: Array = field(default_factory=lambda: np.zeros(2))
     headings: Headings | None = None

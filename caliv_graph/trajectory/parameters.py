@@ -112,6 +112,10 @@ def _slip_moved(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, axle_slip=data.axle_slip + float(d[0]))
 
 
+def _lean_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, lean=data.lean + d)
+
+
 def _scale_moved(data: SmootherInput, d: Array) -> SmootherInput:
     scale = data.speed_scale + float(d[0])
     noise = data.noise
@@ -170,6 +174,16 @@ AXLE_SLIP = InputParameter(
 )
 """Side slip of an axle per lateral acceleration, to the outside of a curve: how soft its tyres are.
 At a constant speed it is as if the axle were `slip v^2` ahead of where it is."""
+
+LEAN = InputParameter(
+    "wheels.lean",
+    ("pitch", "roll"),
+    "rad s^2/m",
+    np.full(2, 1e-3),
+    frozenset({"level"}),
+    _lean_moved,
+)
+"""How the body leans on its springs, per acceleration ahead and to the left."""
 
 SPEED_SCALE = InputParameter(
     "twist.scale", ("value",), "", np.full(1, 1e-3), frozenset({"velocity"}), _scale_moved

@@ -27,6 +27,7 @@ from caliv_graph.trajectory.parameters import (
     HEADING_YAW,
     IMU_PLACE,
     IMU_ROTATION,
+    LEAN,
     LEVER_ARM,
     SECOND_ARM,
     SLOPE,
@@ -56,6 +57,10 @@ the turn."""
 AXLE_SLIP_SIGMA = 0.005
 """1 sigma of the side slip of an axle, radians per m/s^2: tyres of a passenger car let its rear
 axle slip by 2 to 4 degrees per g."""
+
+LEAN_SIGMAS = (0.005, 0.008)
+"""1 sigma of how the body leans by acceleration, radians per m/s^2: cars pitch by 2 to 4 degrees
+per g, and roll by 3 to 7."""
 
 SYNCHRONISED_S = 1e-4
 """1 sigma of a synchronised clock: PPS and PTP are below, NTP on a local network is about there.
@@ -119,6 +124,7 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
     if data.wheels is not None:
         slope = np.full(2, np.radians(wheels.slope_sigma_deg))
         out.append(UncertainParameter(SLOPE, slope, np.zeros(2)))
+        out.append(UncertainParameter(LEAN, np.array(LEAN_SIGMAS), np.zeros(2)))
         if data.wheels.planar:
             out.append(UncertainParameter(AXLE_SLIP, np.full(1, AXLE_SLIP_SIGMA), np.zeros(1)))
     scale = data.speed_scale_sigma

@@ -36,6 +36,7 @@ from caliv_graph.trajectory.parameters import (
     AXLE_SLIP,
     GNSS_TIME_OFFSET,
     HEADING_YAW,
+    LEAN,
     LEVER_ARM,
     SECOND_ARM,
     SPEED_POINT,
@@ -138,7 +139,8 @@ def estimated_scales(
     if data.motion.twist is not None and data.speed_scale_sigma:
         typed.append(speed_scale(data))
     typed += [SPEED_POINT] if data.speed_alone else []
-    typed += [AXLE_SLIP] if data.wheels is not None and data.wheels.planar else []
+    if data.wheels is not None:
+        typed += [LEAN, AXLE_SLIP] if data.wheels.planar else [LEAN]
     typed += [HEADING_YAW] if data.headings is not None else []
     typed += [SECOND_ARM] if data.baselines is not None else []
     columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)

@@ -17,7 +17,13 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray, TwistSamples
-from caliv_graph.trajectory.imu import NO_GAPS, Inertial, interpolate, longest_piece
+from caliv_graph.trajectory.imu import (
+    NO_GAPS,
+    DeadReckoning,
+    Inertial,
+    interpolate,
+    longest_piece,
+)
 from caliv_graph.trajectory.noise import (
     PAPER_GYRO_RAD_S,
     ImuNoise,
@@ -52,6 +58,9 @@ VIBRATION_M_S2 = 0.02
 STEADY_RAD_S = 1e-4
 """rad/s/sqrt(Hz), white rates about x and y. They make the step of a rate that changes regular: far
 below what changes it."""
+
+LEAN_NS = 250_000_000
+"""Half the time over which accelerations are averaged: a body on springs takes as long to lean."""
 
 LEAST_SLIP_M_S = 0.003
 """1 sigma of the lateral and vertical velocity of a standing vehicle."""
@@ -236,6 +245,17 @@ def level_sigmas(nodes_ns: IntArray, model: WheelModel) -> Array:
     """
     density = 2.0 * model.tilt_rad**2 * model.correlation_s
     return np.asarray(np.sqrt(density / node_spans_s(nodes_ns)))
+
+
+def accelerations(twist: TwistSamples, nodes_ns: IntArray, dead: DeadReckoning) -> Array:
+    """(n, 2) m/s^2 ahead and to the left at the nodes, over half a second; `dead` has the rates."""
+    usable = np.isfinite(twist.velocity).all(axis=1)
+    stamps, speeds = np.asarray(twist.stamps_ns)[usable], twist.velocity[usable, :1]
+    begin, end = (np.clip(nodes_ns + shift, stamps[0], stamps[-1]) for shift in (-LEAN_NS, LEAN_NS))
+    before, after = (interpolate(at, stamps, speeds)[:, 0] for at in (begin, end))
+    ahead = (after - before) / ((end - begin) * 1e-9)
+    rates = dead.rates(nodes_ns, LEAN_NS)[:, 2]
+    return np.column_stack([ahead, 0.5 * (before + after) * rates])
 
 
 def normal_of(slope: Array) -> Array:

@@ -213,9 +213,13 @@ def test_a_scaled_velocity_has_the_right_jacobians() -> None:
 def test_level_ground_is_below_the_frame() -> None:
     at = values()
     up = np.array([0.1, -0.2, 1.0]) / np.linalg.norm([0.1, -0.2, 1.0])
-    check_jacobians(level_factor(POSE, up, gtsam.noiseModel.Unit.Create(2)), at)
+    check_jacobians(
+        level_factor(POSE, up, np.array([0.01, -0.02]), gtsam.noiseModel.Unit.Create(2)), at
+    )
     at.update(POSE, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.01, -0.02, 2.0), np.zeros(3)))
-    factor = level_factor(POSE, np.array([0.0, 0.0, 1.0]), gtsam.noiseModel.Unit.Create(2))
+    factor = level_factor(
+        POSE, np.array([0.0, 0.0, 1.0]), np.zeros(2), gtsam.noiseModel.Unit.Create(2)
+    )
     # Nose up by 20 mrad is pitch -0.02; left side up by 10 mrad is roll 0.01.
     np.testing.assert_allclose(factor.unwhitenedError(at), [0.02, 0.01], atol=1e-5)
 

@@ -17,6 +17,7 @@ from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, MotionData, TwistSamples
 from caliv_graph.scenario.drives import Drive
 from caliv_graph.trajectory.heading import heading_disagreement
+from caliv_graph.trajectory.imu import DeadReckoning
 from caliv_graph.trajectory.inputs import check_input
 from caliv_graph.trajectory.parameters import SPEED_POINT
 from caliv_graph.trajectory.physics import motion_physics
@@ -24,6 +25,7 @@ from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.uncertain import AXLE_SLIP_SIGMA
 from caliv_graph.trajectory.wheels import (
+    accelerations,
     level_sigmas,
     node_spans_s,
     wheel_model,
@@ -131,6 +133,45 @@ def test_an_axle_that_slips_in_curves_is_no_axle_elsewhere() -> None:
     assert told > 0.25
     assert slips[1] - slips[0] == pytest.approx(told * softness, rel=0.2)
     assert abs(slips[0]) < 2.0 * sigmas[0]
+
+
+def test_accelerations_are_those_ahead_and_into_the_curve() -> None:
+    motion = wheels(1)
+    data, _ = check_input(motion, settings())
+    assert motion.twist is not None
+    nodes = stamps(DRIVE.duration_s, 10.0, 0.5)
+    dead = DeadReckoning(data.inertial.stamps_ns, data.inertial.gyro, data.inertial.force)
+    found = accelerations(motion.twist, nodes, dead)
+    truth = DRIVE.at(seconds(nodes))
+    speed = np.linalg.norm(truth.velocity_map, axis=1)
+    steady = speed > 1.99
+    # v^2 / r of both circles; the yaw rate has a bias of 4 mrad/s, the speed a scale.
+    left = SCALE * speed * (truth.rates[:, 2] + 0.004)
+    assert np.ptp(left[steady]) > 0.8
+    assert np.abs(found[steady, 1] - left[steady]).max() < 0.04
+    # 2 m/s within seconds, and back.
+    ahead = SCALE * np.gradient(speed, seconds(nodes))
+    assert np.ptp(ahead) > 2.0
+    assert np.sqrt(np.mean((found[:, 0] - ahead) ** 2)) < 0.1
+
+
+def test_roll_and_pitch_do_not_tell_the_height_of_an_antenna() -> None:
+    low, high = (
+        smooth_trajectory(
+            wheels(1),
+            config_for(
+                replace(ANTENNA, lever_arm=(0.3, 0.5, z)), gnss={"lever_arm": [0.3, 0.5, z]}
+            ),
+            stamps(DRIVE.duration_s, 5.0, 0.05),
+        )
+        for z in (1.5, 2.1)
+    )
+    # The sigma of 10 mm stays, and the value.
+    for found, z in ((low, 1.5), (high, 2.1)):
+        sigmas = found.sigmas_of("gnss.lever_arm")
+        assert sigmas is not None
+        assert sigmas[2] == pytest.approx(0.01, rel=1e-3)
+        assert found.data.lever_arm[2] == pytest.approx(z, abs=1e-4)
 
 
 def test_with_an_imu_scale_and_place_of_the_speed_are_found() -> None:

@@ -102,7 +102,7 @@ class Motion:
     Attributes:
         t: (n,) times of the knots, s.
         values: spline of x, y, z, roll, pitch, yaw (m, rad).
-        speed_m_s: (n,) along the course.
+        speed_m_s: (n,) along the course, in plan.
         yaw_rate_rad_s: (n,) of the course.
     """
 
@@ -387,7 +387,9 @@ def measure_wheels(draws: Draws, motion: Motion, rate_hz: float = 50.0) -> Wheel
     rng = draws.stream("wheels")
     t = np.arange(motion.t[0] + 0.01, motion.t[-1] - 0.02, 1 / rate_hz)
     noise = draws.on("wheel_noise")
-    speed = np.interp(t, motion.t, motion.speed_m_s)
+    level = np.interp(t, motion.t, motion.speed_m_s)
+    # Wheels roll along the road, the course is its plan.
+    speed = np.sign(level) * np.hypot(level, motion.values(t, 1)[:, 2])
     speed *= 1 + 0.007 * rng.normal() * draws.on("wheel_scale")
     speed += noise * 0.01 * rng.normal(size=len(t)) * (np.abs(speed) > 0.01)
     if draws.on("wheel_quantisation"):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # Parameters of glibc's mallopt (malloc.h).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
@@ -29,6 +31,23 @@ def give_back_freed_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
     except (AttributeError, OSError, TypeError):
         return  # not glibc
+
+
+@contextmanager
+def collecting_what_is_new() -> Iterator[None]:
+    """Inside, garbage collections pass over the objects that are there already.
+
+    A full collection visits every object of the modules, 0.1 s of processor time. A calibration
+    asks for several (`give_back_freed_memory`). Where a caller has frozen objects, they stay so.
+    """
+    if gc.get_freeze_count():
+        yield
+        return
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def keep_freed_memory() -> bool:

@@ -15,6 +15,7 @@ from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.structure_evidence import (
     StructureEvidence,
 )
+from caliv_graph.common.memory import collecting_what_is_new
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import with_found_of
 from caliv_graph.config.model import Config
@@ -62,7 +63,7 @@ def calibrate(
     """
     # Matrices are small, and threads that share a sum add it up in another order: the same result
     # on any number of cores.
-    with threadpool_limits(limits=1):
+    with threadpool_limits(limits=1), collecting_what_is_new():
         return _calibrate(recordings, config, progress, prior)
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 
 import pytest
+
+from caliv_graph.common.memory import collecting_what_is_new
 
 FAULTS = """
 import resource
@@ -34,3 +37,40 @@ def test_arrays_are_made_of_memory_that_was_freed() -> None:
         pytest.skip("the system's library is not glibc")
     usual, kept = map(int, done.stdout.split())
     assert kept < 0.05 * usual
+
+
+PASSED_OVER = """
+import gc
+import weakref
+from caliv_graph.common.memory import collecting_what_is_new
+
+class Ring:
+    def __init__(self):
+        self.own = self
+
+def ring():
+    return weakref.ref(Ring())
+
+gc.disable()
+old = ring()
+with collecting_what_is_new():
+    new = ring()
+    gc.collect()
+    print(old() is None, new() is None)
+gc.collect()
+print(old() is None, gc.get_freeze_count())
+"""
+
+
+def test_collections_pass_over_what_is_there_until_the_end() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PASSED_OVER], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["False", "True", "True", "0"]
+
+
+def test_what_a_caller_has_frozen_stays_so() -> None:
+    gc.freeze()
+    with collecting_what_is_new():
+        pass
+    assert gc.get_freeze_count()

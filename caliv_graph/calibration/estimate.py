@@ -233,8 +233,7 @@ def _with_noise(
     after = tuple(with_noise(noise, trajectories))
     usual = ground_floors(config.noise)
     changed = with_floors(grounds, after, T_vehicle_lidar, usual, noise.floors)
-    ground = (with_rates_of(o, trajectories[o.drive], after[o.drive]) for o in changed)
-    return after, tuple(ground)
+    return after, with_rates_of(changed, trajectories, after)
 
 
 def _held_grounds(

@@ -29,22 +29,43 @@ def swept_drives(problem: Problem, grounds: Sequence[GroundObservation]) -> list
 
 
 def with_rates_of(
-    observation: GroundObservation, before: VehicleTrajectory, after: VehicleTrajectory
-) -> GroundObservation:
-    """An observation as the rates of another trajectory of its drive would have made it."""
-    if observation.by_rates is None or before is after:
-        return observation
-    R, _ = after.poses_at([observation.stamp_ns])
-    first, last = (round(s * NANOSECONDS_PER_SECOND) for s in observation.taken_s)
-    ends_ns = observation.stamp_ns + np.array([min(first, 0), max(last, 0)])
-    twists = []
-    for trajectory in (before, after):
-        ends = np.clip(ends_ns, *trajectory.span_ns)
-        begin, end = unstack(*trajectory.poses_at(ends))
-        seconds = max(int(ends[1] - ends[0]), 1) / NANOSECONDS_PER_SECOND
-        twists.append(gtsam.Pose3.Logmap(begin.between(end)) / seconds)
-    changed = moved(observation, observation.by_rates @ (twists[1] - twists[0]))
-    return replace(changed, twist_map=turned_twist(R[0], twists[1]), R_map_vehicle=R[0])
+    observations: Sequence[GroundObservation],
+    before: Sequence[VehicleTrajectory],
+    after: Sequence[VehicleTrajectory],
+) -> tuple[GroundObservation, ...]:
+    """Observations as the rates of other trajectories of their drives would have made them.
+
+    The poses of a drive are asked for at once: a call for one takes as long as for hundreds.
+    """
+    out = list(observations)
+    for drive, (one, other) in enumerate(zip(before, after, strict=True)):
+        own = [k for k, o in enumerate(out) if o.drive == drive and o.by_rates is not None]
+        if one is other or not own:
+            continue
+        some = [out[k] for k in own]
+        R, _ = other.poses_at([o.stamp_ns for o in some])
+        twists = [_twists_in_sweeps(some, trajectory) for trajectory in (one, other)]
+        for k, R_map_vehicle, then, now in zip(own, R, *twists, strict=True):
+            by_rates = out[k].by_rates
+            assert by_rates is not None
+            changed = moved(out[k], by_rates @ (now - then))
+            turned = turned_twist(R_map_vehicle, now)
+            out[k] = replace(changed, twist_map=turned, R_map_vehicle=R_map_vehicle)
+    return tuple(out)
+
+
+def _twists_in_sweeps(
+    observations: Sequence[GroundObservation], trajectory: VehicleTrajectory
+) -> Array:
+    """(m, 6) velocity of the vehicle while the points of each observation were taken."""
+    first, last = np.array([o.taken_s for o in observations]).T * NANOSECONDS_PER_SECOND
+    offsets = np.round([np.minimum(first, 0.0), np.maximum(last, 0.0)]).astype(np.int64)
+    stamps = np.array([o.stamp_ns for o in observations], dtype=np.int64)
+    ends = np.clip(stamps + offsets, *trajectory.span_ns)
+    poses = unstack(*trajectory.poses_at(ends.ravel()))
+    seconds = np.maximum(ends[1] - ends[0], 1) / NANOSECONDS_PER_SECOND
+    steps = zip(poses[: len(stamps)], poses[len(stamps) :], seconds, strict=True)
+    return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])
 
 
 def rates_graph(problem: Problem, grounds: Sequence[GroundObservation]) -> CalibrationGraph:

@@ -22,6 +22,7 @@ from caliv_graph.trajectory.deskew import checked_times
 from caliv_graph.trajectory.imu import log_so3
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smoothed import within_span
 
 MAX_SCANS = 150
 """Scans of a LiDAR that are read of a drive. More scans of one place share the errors of its
@@ -234,7 +235,7 @@ def scan_patches(
     Raises:
         TrajectoryError: the stamp is outside the trajectory's span, or times are invalid.
     """
-    R_map_vehicle, _ = trajectory.poses_at([scan.stamp_ns])
+    stamp = within_span([scan.stamp_ns], trajectory.span_ns, "its span")
     times_s = checked_times(scan)
     motion = None
     if times_s is not None:
@@ -244,6 +245,7 @@ def scan_patches(
     at = scan.stamp_ns + np.round(patches.time_s * NANOSECONDS_PER_SECOND).astype(np.int64)
     keep: BoolArray = (at >= begin) & (at <= end)
     if not keep_level:
+        R_map_vehicle, _ = trajectory.poses_at(stamp)
         up_lidar = (R_map_vehicle[0] @ T_vehicle_lidar.rotation().matrix())[2]
         keep &= ~_is_level(patches.normal_lidar, up_lidar)
     return patches.part(keep)

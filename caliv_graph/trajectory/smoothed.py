@@ -28,6 +28,14 @@ PART_NS, PAUSE_NS = 60_000_000_000, 5_000_000_000
 """The IMU is dead reckoned over a minute at a time: over a whole drive its samples take three times
 the memory that they have as they were read. After a longer pause of the stamps it begins anew."""
 
+WINDOW_NS, OVERLAP_NS = 10_000_000_000, 2_000_000_000
+"""What is asked for scan by scan is dead reckoned in windows of the drive that overlap, at times
+that do not depend on what was asked before: by itself each call would begin anew, for most of its
+time."""
+
+KEPT_WINDOWS = 2
+"""Windows that are kept: scans are asked for in order, by two threads at a time."""
+
 RATE_WINDOW_NS = 50_000_000
 """Half the time over which the gyroscope is averaged for the vehicle's velocity."""
 
@@ -162,7 +170,29 @@ class SmoothedTrajectory:
         return Estimate(self.states, graph, to_values(self.states, self.data), self.built_with)
 
     def _dead(self, begin_ns: int, end_ns: int) -> DeadReckoning:
-        """The IMU alone, from the last sample before a time to the first one after another."""
+        """The IMU alone, from the last sample before a time to the first one after another.
+
+        Or over the whole window that both are in.
+        """
+        number = (begin_ns - int(self.nodes_ns[0])) // WINDOW_NS
+        first_ns = int(self.nodes_ns[0]) + number * WINDOW_NS
+        last_ns = first_ns + WINDOW_NS + OVERLAP_NS
+        if end_ns > last_ns:
+            return self._dead_between(begin_ns, end_ns)
+        dead = self._windows.get(number)
+        if dead is None:
+            dead = self._dead_between(first_ns, last_ns)
+            for old in list(self._windows)[: 1 - KEPT_WINDOWS]:
+                self._windows.pop(old, None)
+            self._windows[number] = dead
+        return dead
+
+    @cached_property
+    def _windows(self) -> dict[int, DeadReckoning]:
+        """Of the last windows, by their numbers."""
+        return {}
+
+    def _dead_between(self, begin_ns: int, end_ns: int) -> DeadReckoning:
         stamps = self.inertial.stamps_ns
         first = int(np.searchsorted(stamps, begin_ns, "right")) - 1
         last = int(np.searchsorted(stamps, end_ns, "right")) + 1

@@ -206,13 +206,21 @@ def test_poses_do_not_depend_on_what_else_is_asked_for(monkeypatch: pytest.Monke
     whole = (*smoothed.poses_at(at), *smoothed.velocities_at(at))
 
     monkeypatch.setattr("caliv_graph.trajectory.smoothed.PART_NS", 700_000_000)
+    monkeypatch.setattr("caliv_graph.trajectory.smoothed.WINDOW_NS", 900_000_000)
+    monkeypatch.setattr("caliv_graph.trajectory.smoothed.OVERLAP_NS", 200_000_000)
     apart = replace(smoothed)
     parts = (*apart.poses_at(at), *apart.velocities_at(at))
     singly = [apart.poses_at([stamp]) for stamp in at.tolist()]
+    again = replace(smoothed)
+    backwards = [again.poses_at([stamp]) for stamp in reversed(at.tolist())]
 
     for one, other in zip(whole, parts, strict=True):
         np.testing.assert_allclose(other, one, atol=1e-10)
     np.testing.assert_allclose(np.concatenate([t for _, t in singly]), whole[1], atol=1e-10)
+    # Not by a bit: the result of a calibration does not depend on which thread asks first.
+    for (R, t), (R_again, t_again) in zip(singly, reversed(backwards), strict=True):
+        assert np.array_equal(R, R_again)
+        assert np.array_equal(t, t_again)
 
 
 def test_another_measurement_weighs_the_same_on_the_marginal_as_on_the_whole() -> None:

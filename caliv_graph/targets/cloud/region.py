@@ -7,7 +7,7 @@ by the error that the initial guess may have: 3 degrees at 20 m displace the tar
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -179,6 +179,15 @@ class RegionExtractor:
         self._guess = {name: lidar.guess() for name, lidar in config.lidars.items()}
         self.tallies: dict[str, Tally] = {name: Tally() for name in config.lidars}
         self._edges: dict[str, SeenEdges] = {name: SeenEdges() for name in config.lidars}
+        self._looked_up: tuple[str, IntArray, Array, Array] | None = None
+
+    def look_up(self, lidar: str, stamps_ns: Collection[int]) -> None:
+        """Looks up the poses of the scans of a LiDAR at once, in front of their `candidates`.
+
+        A call for one takes as long as for hundreds. Those of another LiDAR are forgotten.
+        """
+        stamps = np.array(sorted(stamps_ns), dtype=np.int64)
+        self._looked_up = (lidar, stamps, *self._lidar_poses(lidar, stamps))
 
     def fresh(self) -> RegionExtractor:
         """The same extractor with empty tallies; it knows the fields of view."""
@@ -196,7 +205,7 @@ class RegionExtractor:
         tally = self.tallies[scan.lidar]
         tally.scans += 1
         extraction = self._config.extraction
-        R, t = (part[0] for part in self._lidar_poses(scan.lidar, [scan.stamp_ns]))
+        R, t = self._lidar_pose(scan.lidar, scan.stamp_ns)
         if len(scan.points_lidar) == 0:
             tally.rejected[EMPTY] += 1
             return []
@@ -261,7 +270,17 @@ class RegionExtractor:
             tally.sparse.append(max(sizes))
         return out
 
-    def _lidar_poses(self, lidar: str, stamps_ns: Sequence[int]) -> tuple[Array, Array]:
+    def _lidar_pose(self, lidar: str, stamp_ns: int) -> tuple[Array, Array]:
+        """Rotation (3, 3) and translation (3,) of T_region_lidar, at the guess."""
+        if self._looked_up is not None and self._looked_up[0] == lidar:
+            _, stamps, R, t = self._looked_up
+            at = int(np.searchsorted(stamps, stamp_ns))
+            if at < len(stamps) and stamps[at] == stamp_ns:
+                return R[at], t[at]
+        R, t = self._lidar_poses(lidar, [stamp_ns])
+        return R[0], t[0]
+
+    def _lidar_poses(self, lidar: str, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
         """Rotations (m, 3, 3) and translations (m, 3) of T_region_lidar, at the guess."""
         R_map_vehicle, t_map_vehicle = self.trajectory.poses_at(stamps_ns)
         guess = self._guess[lidar]

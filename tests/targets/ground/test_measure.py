@@ -175,7 +175,7 @@ def test_meter_tells_what_other_rates_would_have_made_of_it() -> None:
         change = 1e3 * np.append(tilts, found.distance_m - usual.distance_m)
         assert change == pytest.approx(usual.by_rates[:, k], rel=0.1, abs=0.02)
         # The same from the observation alone, where a drive was smoothed again.
-        again = with_rates_of(usual, turning(twist), turning(twist + d))
+        (again,) = with_rates_of([usual], [turning(twist)], [turning(twist + d)])
         assert again.normal_lidar == pytest.approx(found.normal_lidar, abs=5e-6)
         assert again.distance_m == pytest.approx(found.distance_m, abs=1e-5)
         (moved,) = deskewed(scan, [T], turning(twist + d))

@@ -177,14 +177,20 @@ def planar_patches(
         slot = np.clip(((times_s - motion.first_s) / SLOT_S).astype(np.int64), 0, None)
         slot = np.minimum(slot, len(motion.turn) - 1)
     left = np.arange(len(points))
+    by_axis = points.T.copy()  # numpy is fast along a row
     found: list[ScanPatches] = []
     uneven = grazing = 0
     for undone in SHAPES:
         groups = _grouped(cells, left, undone, slot)
         left = left[groups.order]
-        at, times = points[left], None if times_s is None else times_s[left]
-        own = channels and channels.only(left)
-        patches, judged = _judged(groups, at, times, motion, slot[left], sigma_range_m, own)
+        enough = groups.count >= MIN_POINTS
+        chosen = np.repeat(enough, groups.count)
+        some = left[chosen]
+        at, times = by_axis.take(some, axis=1), None if times_s is None else times_s[some]
+        own, number = channels and channels.only(some), groups.count[enough]
+        patches, decided = _judged(number, at, times, motion, slot[some], sigma_range_m, own)
+        judged = np.zeros(len(left), dtype=bool)
+        judged[chosen] = np.repeat(decided, number)
         found.append(patches)
         uneven += patches.uneven
         grazing += patches.grazing
@@ -244,12 +250,10 @@ def _cells(points: Array) -> _Cells:
 
 @dataclass(frozen=True)
 class _Groups:
-    """Points sorted by group: `order` (n,), first place of each group, number of each, group of."""
+    """Points sorted by group: `order` (n,), and how many each group has."""
 
     order: IntArray
-    first: IntArray
     count: IntArray
-    member: IntArray
 
 
 def _grouped(cells: _Cells, some: IntArray, undone: tuple[int, int], slot: IntArray) -> _Groups:
@@ -264,39 +268,37 @@ def _grouped(cells: _Cells, some: IntArray, undone: tuple[int, int], slot: IntAr
     starts = np.ones(len(key), dtype=bool)
     starts[1:] = key[1:] != key[:-1]
     first = np.flatnonzero(starts)
-    return _Groups(order, first, np.diff(np.append(first, len(key))), np.cumsum(starts) - 1)
+    return _Groups(order, np.diff(np.append(first, len(key))))
 
 
 def _judged(
-    groups: _Groups,
-    points: Array,
+    number: IntArray,
+    p: Array,
     times_s: Array | None,
     motion: SweepMotion | None,
     slot: IntArray,
     sigma_range_m: float,
     channels: PointChannels | None,
 ) -> tuple[ScanPatches, BoolArray]:
-    """Patches among the groups; and for each point whether its group is decided, flat or not."""
-    enough = groups.count >= MIN_POINTS
-    chosen = enough[groups.member]
-    group = (np.cumsum(enough) - 1)[groups.member[chosen]]
-    count = groups.count[enough].astype(np.float64)
-    first = np.concatenate([[0], np.cumsum(groups.count[enough])[:-1]]).astype(np.int64)
-    p = points[chosen].T.copy()
+    """Patches among groups; and (n,) whether each group is decided, flat or not.
+
+    Points p (3, N) are in the order of the groups, `number` (n,) of each, of one slot.
+    """
+    count = number.astype(np.float64)
+    first = np.concatenate([[0], np.cumsum(number)[:-1]]).astype(np.int64)
     time_s = np.zeros(len(count))
     if not len(count):
         empty = ScanPatches(time_s, np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros(0))
-        return empty, np.zeros(len(points), dtype=bool)
+        return empty, np.zeros(0, dtype=bool)
     swept = None
     if times_s is not None and motion is not None:
-        t = times_s[chosen]
-        time_s = np.add.reduceat(t, first) / count
-        k = slot[chosen]
-        after_s = t - time_s[group]
-        p += after_s * (np.cross(motion.turn[k].T, p, axis=0) + motion.velocity[k].T)
+        time_s = np.add.reduceat(times_s, first) / count
+        k = slot[first]
+        after_s = times_s - np.repeat(time_s, number)
+        p = _moved(p, after_s, motion.turn[k], motion.velocity[k], number)
         swept = Swept(
             _moments(p, first, np.add.reduceat(after_s, first), after_s),
-            np.hstack([motion.turn, motion.velocity])[k[first]],
+            np.hstack([motion.turn, motion.velocity])[k],
         )
     moments = _moments(p, first, count)
     centre = moments[:, :3, 3] / count[:, None]
@@ -314,11 +316,10 @@ def _judged(
     # A thick group may become flat when it is seen as a part of nothing else: it is decided.
     tilt = np.maximum(scatter, sigma_range_m * cosine) / (width[:, 1] * np.sqrt(count) + 1e-12)
     broad = (width[:, 1] > MIN_WIDTH * np.maximum(scatter, 1e-6)) & (tilt < MAX_TILT_RAD)
-    spread, bend, skewness, length = _shape(p, group, first, count, centre, axes, width)
+    spread, bend, skewness, length = _shape(p, number, first, count, centre, axes, width)
     broad &= spread > MIN_SPREAD
-    own = channels and channels.only(chosen)
-    if own is not None:
-        several, span = own.number(first)
+    if channels is not None:
+        several, span = channels.number(first)
         apart = range_m * span / np.maximum(cosine, MIN_INCIDENCE_COS)
         broad &= (several >= MIN_CHANNELS) | (2.0 * apart > MAX_PATCH_M)
     uneven = bend > MAX_BEND_M + 2.0 * scatter / np.sqrt(count)
@@ -326,13 +327,11 @@ def _judged(
     seen = (cosine > MIN_INCIDENCE_COS) & (length < MAX_PATCH_M)
     good = flat & broad & ~uneven & seen
     decided = ~flat | broad
-    judged = np.zeros(len(points), dtype=bool)
-    judged[chosen] = decided[group]
     by_channel = None
-    if own is not None:
-        kept = good[group]
-        number = np.cumsum(good) - 1
-        by_channel = own.only(kept).sums(p[:, kept], number[group[kept]])
+    if channels is not None:
+        kept, patch = np.repeat(good, number), np.arange(np.count_nonzero(good))
+        own = channels.only(kept)
+        by_channel = own.sums(p[:, kept], np.repeat(patch, number[good]))
     patches = ScanPatches(
         time_s=time_s[good],
         moments=moments[good],
@@ -343,7 +342,26 @@ def _judged(
         uneven=int(count[decided & (~flat | uneven)].sum()),
         grazing=int(count[flat & broad & ~uneven & ~seen].sum()),
     )
-    return patches, judged
+    return patches, decided
+
+
+def _moved(p: Array, after_s: Array, turn: Array, velocity: Array, number: IntArray) -> Array:
+    """Points p (3, N), moved over times (N,) by the twists (n, 3) of groups of `number` (n,).
+
+    Axis by axis: each is a row, along which numpy is fast.
+    """
+    w, v = (np.repeat(of_groups.T, number, axis=1) for of_groups in (turn, velocity))
+    crossed = (w[i] * p[j] - w[j] * p[i] for i, j in ((1, 2), (2, 0), (0, 1)))
+    return np.stack([at + after_s * (c + s) for at, c, s in zip(p, crossed, v, strict=True)])
+
+
+def _along(axis: Array, number: IntArray, p: Array) -> Array:
+    """(N,) coordinates of points p (3, N) along the axes (n, 3) of groups of `number` (n,)."""
+    x, y, z = (np.repeat(part, number) for part in axis.T)
+    out = x * p[0]
+    out += y * p[1]
+    out += z * p[2]
+    return np.asarray(out)
 
 
 def _moments(p: Array, first: IntArray, count: Array, weight: Array | None = None) -> Array:
@@ -366,23 +384,23 @@ def _moments(p: Array, first: IntArray, count: Array, weight: Array | None = Non
 
 def _shape(
     p: Array,
-    group: IntArray,
+    number: IntArray,
     first: IntArray,
     count: Array,
     centre: Array,
     axes: Array,
     width: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Spread, bend, skewness and length of groups; each (n,).
+    """Spread, bend, skewness and length of groups; each (n,). `count` is their `number`.
 
     The spread is how evenly a group is spread along its worse axis, the length is in metres, the
     skewness is that of the points along the normal. The bend, metres, is the root mean square of
     the residuals' parts of second and third order.
     """
-    off = p - centre.T[:, group]
+    off = p - np.repeat(centre.T, number, axis=1)
     scaled = axes / np.maximum(width, 1e-9)[:, None, :]
-    v, u = (np.einsum("in,in->n", scaled[:, :, k].T[:, group], off) for k in (1, 2))
-    r = np.einsum("in,in->n", axes[:, :, 0].T[:, group], off)
+    v, u = (_along(scaled[:, :, k], number, off) for k in (1, 2))
+    r = _along(axes[:, :, 0], number, off)
     uu, vv = u * u, v * v
     powers = np.stack([uu * u, vv * v, uu * uu, vv * vv, uu * v, u * vv, uu * vv])
     u3, v3, u4, v4, uuv, uvv, uuvv = np.add.reduceat(powers, first, 1) / count

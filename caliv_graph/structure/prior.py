@@ -108,8 +108,7 @@ class PosePrior:
 
     def by_now(self, moved: Array) -> Array:
         """(m, 6, 6) derivatives of the poses' part of d at `moved`."""
-        xi = moved[: 6 * len(self.stamps_ns)].reshape(-1, 6)
-        return np.array([self.chart.derivative(self.chart.pose(v)) for v in xi])
+        return self.chart.derivatives(moved[: 6 * len(self.stamps_ns)].reshape(-1, 6))
 
 
 def _turned(rows: Array, by_now: Array) -> Array:

@@ -11,10 +11,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import compress
 
 import gtsam
 import numpy as np
-import scipy.sparse
 
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import skew
@@ -308,7 +308,6 @@ class Gaussian:
                     blocks.append(gtsam.Pose3.LogmapDerivative(T))
                 else:
                     apart.append(self.chart.coordinates(T))
-                    blocks.append(self.chart.derivative(T))
             elif isinstance(mean, gtsam.Rot3):
                 turn = gtsam.Rot3.Logmap(mean.between(values.atRot3(key)))
                 apart.append(turn)
@@ -316,9 +315,30 @@ class Gaussian:
             else:
                 apart.append(values.atVector(key) - mean)
                 blocks.append(np.eye(len(mean)))
-        J = scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
-        H = J.T @ (self.information @ J)
-        return 0.5 * (H + H.T), J.T @ (self.gradient - self.information @ np.concatenate(apart))
+        if self.chart is not None:
+            of_poses = [isinstance(mean, gtsam.Pose3) for mean in self.means]
+            found = iter(self.chart.derivatives(np.array(list(compress(apart, of_poses)))))
+            others = iter(blocks)
+            blocks = [next(found if is_pose else others) for is_pose in of_poses]
+        d = np.concatenate(apart)
+        H = _by_blocks(blocks, _by_blocks(blocks, self.information).T)
+        b = _by_blocks(blocks, (self.gradient - self.information @ d)[:, None])[:, 0]
+        return 0.5 * (H + H.T), b
+
+
+def _by_blocks(blocks: Sequence[Array], rows: Array) -> Array:
+    """(n, k) `J^T rows` of rows (n, k), J block diagonal: a sparse product takes several times it.
+
+    Blocks of one size in a row are multiplied together.
+    """
+    out, start = np.empty(rows.shape), 0
+    for size, some in itertools.groupby(blocks, key=len):
+        own = np.array(list(some))
+        part = slice(start, start + size * len(own))
+        start = part.stop
+        of_blocks = rows[part].reshape(len(own), size, -1)
+        out[part] = np.matmul(np.swapaxes(own, 1, 2), of_blocks).reshape(-1, rows.shape[1])
+    return out
 
 
 def marginal_factor(

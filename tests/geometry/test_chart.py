@@ -19,11 +19,23 @@ def test_a_pose_is_that_of_its_coordinates() -> None:
     assert CHART.coordinates(gtsam.Pose3.Expmap(1e-6 * d)) == pytest.approx(1e-6 * d, abs=1e-11)
 
 
-def test_derivative_is_that_of_the_coordinates() -> None:
-    T = CHART.pose(0.5 * np.random.default_rng(2).standard_normal(6))
-    for k, e in enumerate(1e-6 * np.eye(6)):
-        ahead, behind = (CHART.coordinates(T.retract(step)) for step in (e, -e))
-        assert CHART.derivative(T)[:, k] == pytest.approx((ahead - behind) / 2e-6, abs=1e-8)
+def test_derivatives_are_those_of_the_coordinates() -> None:
+    directions = np.random.default_rng(2).standard_normal((6, 6))
+    # On both sides of where a series ends.
+    sizes = np.array([0.0, 1e-4, 0.1, 0.29, 0.31, 2.0]) / np.linalg.norm(directions[:, :3], axis=1)
+    moved = sizes[:, None] * directions
+    for d, derivative in zip(moved, CHART.derivatives(moved), strict=True):
+        T = CHART.pose(d)
+        for k, e in enumerate(1e-6 * np.eye(6)):
+            ahead, behind = (CHART.coordinates(T.retract(step)) for step in (e, -e))
+            assert derivative[:, k] == pytest.approx((ahead - behind) / 2e-6, abs=1e-8)
+
+
+def test_derivatives_where_a_series_ends_are_to_the_last_digits() -> None:
+    turns = np.zeros((2, 6))
+    turns[:, :3] = np.array([[0.3 - 1e-13], [0.3 + 1e-13]]) * [0.6, 0.0, 0.8]
+    one, other = CHART.derivatives(turns)
+    assert one == pytest.approx(other, abs=1e-12)
 
 
 def test_a_turn_about_the_pivot_moves_all_shifts_alike() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -70,19 +70,21 @@ def _chain(
     return after, moves[::-1]
 
 
-def compensated(observation: GroundObservation, R_vehicle_lidar: Array) -> tuple[Array, Array]:
-    """An observation, its motion compensated with another extrinsic.
-
-    Returns (3,) tilts along its axes and distance, and (3, 3) by a right perturbation of the
-    rotation.
-    """
+def compensated(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:
+    """(3,) tilts along its axes and distance of an observation compensated with an extrinsic."""
     said = np.array([0.0, 0.0, observation.distance_m])
     if observation.R_vehicle_lidar is None or observation.by_extrinsic is None:
-        return said, np.zeros((3, 3))
+        return said
     turn = gtsam.Rot3(observation.R_vehicle_lidar.T @ R_vehicle_lidar)
-    w = gtsam.Rot3.Logmap(turn)
-    by_turn = observation.by_extrinsic @ gtsam.Rot3.LogmapDerivative(w)
-    return said + observation.by_extrinsic @ w, np.asarray(by_turn)
+    return np.asarray(said + observation.by_extrinsic @ gtsam.Rot3.Logmap(turn))
+
+
+def compensated_by_turn(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:
+    """(3, 3) derivative of `compensated` by a right perturbation of the rotation."""
+    if observation.R_vehicle_lidar is None or observation.by_extrinsic is None:
+        return np.zeros((3, 3))
+    turn = gtsam.Rot3.Logmap(gtsam.Rot3(observation.R_vehicle_lidar.T @ R_vehicle_lidar))
+    return np.asarray(observation.by_extrinsic @ gtsam.Rot3.LogmapDerivative(turn))
 
 
 def held(observation: GroundObservation, R_vehicle_lidar: Array) -> GroundObservation:
@@ -91,7 +93,7 @@ def held(observation: GroundObservation, R_vehicle_lidar: Array) -> GroundObserv
     Where clouds are put together with that extrinsic as well, both turn alike, and neither says
     anything about it.
     """
-    change = compensated(observation, R_vehicle_lidar)[0]
+    change = compensated(observation, R_vehicle_lidar)
     change[2] -= observation.distance_m
     return replace(moved(observation, change), R_vehicle_lidar=None, by_extrinsic=None)
 
@@ -149,6 +151,7 @@ def ground_plane_factor(
         nuisances[key_bias] = by_bias
     if key_rates is not None and observation.by_rates is not None:
         nuisances[key_rates] = -observation.by_rates @ by_rates(_turning(observation))
+    moving = _Moving.of(observation) if key_rates in nuisances else None
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T, moves = _chain(values, poses, jacobians is not None)
@@ -157,25 +160,29 @@ def ground_plane_factor(
         R_lidar_map = T.rotation().matrix().T
         n_lidar = R_lidar_map @ n
         R_map_vehicle = values.atPose3(poses[0]).rotation()
-        said, by_turn = compensated(observation, R_map_vehicle.between(T.rotation()).matrix())
-        change, by_vehicle_turn = np.zeros(3), np.zeros((3, 3))
-        if key_rates in nuisances:
-            change, by_vehicle_turn = with_twist(observation, R_map_vehicle.matrix())
+        R_vehicle_lidar = R_map_vehicle.between(T.rotation()).matrix()
+        said = compensated(observation, R_vehicle_lidar)
+        twist = None if moving is None else moving.at(R_map_vehicle.matrix())
+        if moving is not None and twist is not None:
+            said += moving.by_rates @ twist - moving.usual
         if jacobians is not None:
             J = np.zeros((3, 6))
             J[:2, :3] = axes @ skew(n_lidar)
             J[2, 3:] = n_lidar
             jacobians[0] = J @ moves[0]
-            J[:, :3] -= by_turn
+            J[:, :3] -= compensated_by_turn(observation, R_vehicle_lidar)
             for i, move in enumerate(moves[1:], start=1):
                 jacobians[i] = J @ move
             jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ normal_jacobian(g), by_plane])
             for i, by_one in enumerate(nuisances.values(), start=len(moves) + 1):
                 jacobians[i] = by_one
-            jacobians[0][:, :3] -= by_vehicle_turn
+            if moving is not None and twist is not None:
+                jacobians[0][:, :3] -= moving.by_rates @ twist_by_turn(twist)
         for key, by_one in nuisances.items():
             said = said - by_one @ values.atVector(key)
-        return np.asarray(np.append(axes @ n_lidar, d) - (said + change))
+        r = np.empty(3)
+        r[:2], r[2] = axes @ n_lidar, d
+        return np.asarray(r - said)
 
     cov = with_heave(observation, heave_m)
     if observation.repeated is not None:
@@ -184,18 +191,31 @@ def ground_plane_factor(
     return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
 
 
-def with_twist(observation: GroundObservation, R_map_vehicle: Array) -> tuple[Array, Array]:
-    """(3,) change of an observation whose points moved with the same velocities in the map.
+@dataclass(frozen=True)
+class _Moving:
+    """How an observation changes whose points moved with the same velocities in the map.
 
-    By another rotation of the vehicle than that of the trajectory; and (3, 3) its derivative by a
-    right perturbation of that rotation.
+    Attributes:
+        twist_map: (6,) of the vehicle, by the trajectory.
+        by_rates: (3, 6) change of the observation by that twist in vehicle axes.
+        usual: (3,) what the twist makes of it at the rotation of the trajectory.
     """
-    V, R_0, by_twist = observation.twist_map, observation.R_map_vehicle, observation.by_rates
-    if V is None or R_0 is None or by_twist is None:
-        return np.zeros(3), np.zeros((3, 3))
-    twist = turned_twist(R_map_vehicle.T, V)
-    change = by_twist @ (twist - turned_twist(R_0.T, V))
-    return change, by_twist @ twist_by_turn(twist)
+
+    twist_map: Array
+    by_rates: Array
+    usual: Array
+
+    @classmethod
+    def of(cls, observation: GroundObservation) -> _Moving | None:
+        """None if the observation does not tell."""
+        V, R_0, by_twist = observation.twist_map, observation.R_map_vehicle, observation.by_rates
+        if V is None or R_0 is None or by_twist is None:
+            return None
+        return cls(V, by_twist, by_twist @ turned_twist(R_0.T, V))
+
+    def at(self, R_map_vehicle: Array) -> Array:
+        """(6,) the twist in vehicle axes, at another rotation of the vehicle."""
+        return turned_twist(R_map_vehicle.T, self.twist_map)
 
 
 def _turning(observation: GroundObservation) -> Array:

@@ -61,7 +61,7 @@ def _residuals(
             T = poses[i].compose(extrinsics[o.lidar])
             g = values.atVector(key_ground(o.drive))
             d, _, n = height_over(g, centres[o.drive], T.translation())
-            said, _ = compensated(o, extrinsics[o.lidar].rotation().matrix())
+            said = compensated(o, extrinsics[o.lidar].rotation().matrix())
             out[row] = np.append(o.axes_lidar @ T.rotation().matrix().T @ n, d) - said
     return out
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -229,7 +229,9 @@ def fitted_noise(
     """
     offsets = geometry.offsets_m(sightings)
     sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)
-    fitted = _fitted_share(before, sightings, weights, solve, layout, sigma)
+    seen = _seen_signs(before, sightings, weights, layout, sigma)
+    asked = _Asked.of(solve, layout, seen)
+    fitted = float((seen * asked.of_offsets).sum() / PROBES / max(weights.sum(), 1.0))
     free = 1.0 - min(fitted, MOST_FITTED)
     point = 1.0 / sightings.moments[:, 3, 3]
     total_sigma = _common_sigma(offsets, point, free)
@@ -248,37 +250,76 @@ def fitted_noise(
         nuisances,
         sighting=np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2)),
         shared=math.sqrt(shared),
-        bias=_bias_sigma(solve, layout, nuisances.bias, errors, ranges),
-        surface=_surface_sigma(solve, layout, nuisances.surface, errors, ranges.surface_m),
+        bias=_bias_sigma(asked, layout, nuisances.bias, errors, ranges),
+        surface=_surface_sigma(asked, layout, nuisances.surface, errors, ranges.surface_m),
         strip=np.maximum(
-            _strip_sigmas(solve, layout, nuisances.strip, errors),
+            _strip_sigmas(asked, layout, nuisances.strip, errors),
             ONE_VIEW_M if one else LEAST_M,
         ),
         repeated=1.0 if one else float(np.clip(again / (common**2 + shared), 0.0, 1.0)),
         beams=_beam_sigmas(covariance, layout, nuisances.beams, errors, ranges),
-        bend=_bend_sigmas(solve, layout, nuisances.bend, errors, level, one),
-        jitter_s=_jitter_sigma(solve, layout, nuisances.jitter_s, errors),
+        bend=_bend_sigmas(asked, layout, nuisances.bend, errors, level, one),
+        jitter_s=_jitter_sigma(asked, layout, nuisances.jitter_s, errors),
     )
 
 
-def _fitted_share(
-    geometry: Geometry,
-    sightings: Sightings,
-    weights: Array,
-    solve: Callable[[Array], Array],
-    layout: Layout,
-    sigma: Array,
-) -> float:
-    """Share of the offsets' variance that the estimate takes up: `tr(J H^-1 J^T W) / sum(w)`.
+def _seen_signs(
+    geometry: Geometry, sightings: Sightings, weights: Array, layout: Layout, sigma: Array
+) -> Array:
+    """(D, PROBES) `J^T W^1/2` times random signs, by which `tr(J H^-1 J^T W)` is estimated.
 
-    W is that of the system: an outlier without weight says nothing. By random signs (Hutchinson):
-    the exact trace costs as much as all else together.
+    That over `sum(w)` is the share of the offsets' variance that the estimate takes up. W is that
+    of the system: an outlier without weight says nothing. By random signs (Hutchinson): the exact
+    trace costs as much as all else together.
     """
     J = geometry.offset_rows(sightings, layout.size)
     root = np.sqrt(weights / _variances(sightings, sigma))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (sightings.count, PROBES))
-    seen = J.T @ (root[:, None] * signs)
-    return float((seen * solve(seen)).sum() / PROBES / max(weights.sum(), 1.0))
+    return np.asarray(J.T @ (root[:, None] * signs))
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What noise levels are fitted by: H^-1 times some columns.
+
+    Attributes:
+        of_offsets: (D, PROBES) those of `_seen_signs`.
+        of_biases: (n, n) block of H^-1 of the biases of the LiDARs' ranges.
+        of_signs: first coordinate of some errors -> random signs (n, PROBES) on them, and H^-1
+            times these, there.
+    """
+
+    of_offsets: Array
+    of_biases: Array
+    of_signs: Mapping[int, tuple[Array, Array]]
+
+    @classmethod
+    def of(cls, solve: Callable[[Array], Array], layout: Layout, seen: Array) -> _Asked:
+        """Asks for all at once: a solve takes a pass over the surfaces, for one column or many."""
+        biases = biases_of(layout)
+        errors = [slice(layout.surface_error, layout.strip_error)]
+        errors.append(slice(layout.strip_error, layout.size))
+        if layout.bent:
+            errors.append(slice(layout.bend, layout.surface_error))
+        if layout.jitters:
+            errors.append(slice(layout.jitter, layout.plane))
+        units = np.zeros((layout.size, len(biases)))
+        units[biases, np.arange(len(biases))] = 1.0
+        columns = [seen, units]
+        for own in errors:
+            signs = np.zeros((layout.size, PROBES))
+            signs[own] = np.random.default_rng(1).choice([-1.0, 1.0], signs[own].shape)
+            columns.append(signs)
+        ends = np.cumsum([of.shape[1] for of in columns])[:-1]
+        of_offsets, of_units, *of_errors = np.split(solve(np.hstack(columns)), ends, axis=1)
+        known = zip(errors, columns[2:], of_errors, strict=True)
+        of_signs = {own.start: (signs[own], found[own]) for own, signs, found in known}
+        return cls(of_offsets, of_units[biases], of_signs)
+
+
+def biases_of(layout: Layout) -> IntArray:
+    """(n,) coordinates of the biases of the LiDARs' ranges."""
+    return np.arange(layout.error, layout.beam, BIASES)
 
 
 def _common_sigma(offsets: Array, point: Array, free: float) -> float:
@@ -300,35 +341,29 @@ def _shared_variance(offsets: Array, group: IntArray) -> float:
     return float((total**2).sum() - (offsets**2).sum()) / pairs if pairs else 0.0
 
 
-def _known(
-    solve: Callable[[Array], Array], layout: Layout, own: slice, before: Array | float
-) -> Array:
+def _known(asked: _Asked, own: slice, before: Array | float) -> Array:
     """How much of each error the data know: 1 less its variance by the prior's.
 
     By random signs (Hutchinson). `own` are the coordinates, `before` is their sigma or, again and
     again, (n,) sigmas; the result is (..., n).
     """
-    signs = np.random.default_rng(1).choice([-1.0, 1.0], (own.stop - own.start, PROBES))
-    some = np.zeros((layout.size, PROBES))
-    some[own] = signs
-    variance = (signs * solve(some)[own]).mean(axis=1)
+    signs, solved = asked.of_signs[own.start]
+    variance = (signs * solved).mean(axis=1)
     return np.asarray(1.0 - variance.reshape(-1, np.size(before)) / before**2)
 
 
-def _jitter_sigma(
-    solve: Callable[[Array], Array], layout: Layout, before_s: float, errors: Array
-) -> float:
+def _jitter_sigma(asked: _Asked, layout: Layout, before_s: float, errors: Array) -> float:
     """1 sigma of the jitter of stamps: a fixed-point step of its likelihood; 0 stays."""
     own = slice(layout.jitter, layout.plane)
     if before_s == 0.0 or not layout.jitters:
         return before_s
-    known = float(_known(solve, layout, own, before_s).sum())
+    known = float(_known(asked, own, before_s).sum())
     found = math.sqrt(float((errors[own] ** 2).sum()) / max(known, 1.0))
     return float(np.clip(found, LEAST_JITTER_S, MOST_JITTER_S))
 
 
 def _bias_sigma(
-    solve: Callable[[Array], Array],
+    asked: _Asked,
     layout: Layout,
     before: float,
     errors: Array,
@@ -338,10 +373,8 @@ def _bias_sigma(
 
     A LiDAR for whose bias its place makes up says nothing of it.
     """
-    own = np.arange(layout.error, layout.beam, BIASES)
-    unit = np.zeros((layout.size, len(own)))
-    unit[own, np.arange(len(own))] = 1.0
-    known = np.linalg.inv(solve(unit)[own])
+    own = biases_of(layout)
+    known = np.linalg.inv(asked.of_biases)
     information = known - before**-2.0 * np.eye(len(own))
     kinds = np.zeros(len(own), dtype=np.int64)
     prior = ranges.offsets
@@ -350,14 +383,14 @@ def _bias_sigma(
 
 
 def _surface_sigma(
-    solve: Callable[[Array], Array], layout: Layout, before: float, errors: Array, usual: float
+    asked: _Asked, layout: Layout, before: float, errors: Array, usual: float
 ) -> float:
     """1 sigma of the biases of LiDARs on surfaces: a fixed-point step of its likelihood.
 
     The usual one counts as one bias beside those that the drive determines.
     """
     own = slice(layout.surface_error, layout.strip_error)
-    known = max(float(_known(solve, layout, own, before).sum()), 0.0)
+    known = max(float(_known(asked, own, before).sum()), 0.0)
     total = usual**2 + float((errors[own] ** 2).sum())
     return math.sqrt(total / (1.0 + known))
 
@@ -443,22 +476,20 @@ def _common_size(cov: Array, error: Array, sigma: Array, prior: SizePrior) -> fl
     return math.sqrt(float(weights @ prior.sigmas**2))
 
 
-def _strip_sigmas(
-    solve: Callable[[Array], Array], layout: Layout, before: Array, errors: Array
-) -> Array:
+def _strip_sigmas(asked: _Asked, layout: Layout, before: Array, errors: Array) -> Array:
     """(K,) 1 sigma of how far LiDARs see each strip apart: a fixed-point step of its likelihood.
 
     The offsets have a t distribution (EM: each strip has a variance of its own about the common
     one): strips with a reveal in them are seen centimetres apart, others a millimetre.
     """
     own = slice(layout.strip_error, layout.size)
-    known = np.clip(_known(solve, layout, own, before), 0.0, 1.0).sum(axis=0)
+    known = np.clip(_known(asked, own, before), 0.0, 1.0).sum(axis=0)
     square = (errors[own].reshape(layout.lidars, -1) ** 2).sum(axis=0)
     return _heavy_tailed(known, square, before, STRIP_USUAL_M, (LEAST_M, MOST_STRIP_M))
 
 
 def _bend_sigmas(
-    solve: Callable[[Array], Array],
+    asked: _Asked,
     layout: Layout,
     before: Array,
     errors: Array,
@@ -472,7 +503,7 @@ def _bend_sigmas(
     if not layout.bent:
         return before
     own = slice(layout.bend, layout.surface_error)
-    known = np.clip(_known(solve, layout, own, before), 0.0, 1.0).sum(axis=0)
+    known = np.clip(_known(asked, own, before), 0.0, 1.0).sum(axis=0)
     square = (errors[own].reshape(BENDS, -1) ** 2).sum(axis=0)
     limits = (USUAL_PER_M if one_view else LEAST_BEND_PER_M, MOST_BEND_PER_M)
     out = np.array(before)

@@ -210,9 +210,11 @@ class Pairs:
         cloud = self._cloud
         R, t = _lidar_poses(cloud.R, cloud.t, cloud.lidar, poses)
         R_scan, t_scan = _lidar_poses(cloud.R_scan, cloud.t_scan, cloud.scan_lidar, poses)
-        centre = np.einsum("nij,nj->ni", R[self._source], cloud.centre[self._source])
-        centre += t[self._source]
-        normal = np.einsum("nij,nj->ni", R[self._source], cloud.normal[self._source])
+        some = cloud.sources
+        of_source = np.einsum("nij,nj->ni", R[some], cloud.centre[some]) + t[some]
+        centre = np.repeat(of_source, PAIRS, axis=0)
+        of_source = np.einsum("nij,nj->ni", R[some], cloud.normal[some])
+        normal = np.repeat(of_source, PAIRS, axis=0)
         other = np.full(len(self._source), -1)
         order = np.argsort(self._scan, kind="stable")
         numbers, count = np.unique(self._scan, return_counts=True)

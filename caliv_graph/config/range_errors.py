@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, IntArray
@@ -170,12 +169,13 @@ def size_weights(
     """
     if len(priors) == 1:
         return _weights(_costs(information, pull, priors[0].sigmas) + priors[0].cost)
-    cost = np.zeros([len(prior.sigmas) for prior in priors])
-    for at in np.ndindex(*cost.shape):
-        sizes = np.array([prior.sigmas[i] for prior, i in zip(priors, at, strict=True)])
-        sigma = sizes[kinds]
-        cost[at] = _cost(sigma[:, None] * information * sigma, sigma * pull)
-        cost[at] += sum(prior.cost[i] for prior, i in zip(priors, at, strict=True))
+    sizes = np.stack(np.meshgrid(*(prior.sigmas for prior in priors), indexing="ij"), axis=-1)
+    cost = np.zeros(sizes.shape[:-1])
+    for k, prior in enumerate(priors):
+        cost += prior.cost.reshape([-1 if axis == k else 1 for axis in range(len(priors))])
+    # One size of the first kind at a time: temporary memory is small.
+    for of_first, some in zip(cost, sizes, strict=True):
+        of_first += _costs_of(information, pull, some[..., kinds])
     return _weights(cost)
 
 
@@ -186,7 +186,7 @@ def _weights(cost: Array) -> Array:
 
 
 def _costs(information: Array, pull: Array, sigmas: Array) -> Array:
-    """(n,) `_cost` of errors that have one sigma, at each of some (n,)."""
+    """(n,) `_costs_of` errors that have one sigma, at each of some (n,)."""
     values, axes = np.linalg.eigh(0.5 * (information + information.T))
     values = np.maximum(values, 0.0)
     variances = sigmas[:, None] ** 2
@@ -194,8 +194,10 @@ def _costs(information: Array, pull: Array, sigmas: Array) -> Array:
     return np.asarray(0.5 * (np.log(known) - variances * (axes.T @ pull) ** 2 / known).sum(axis=1))
 
 
-def _cost(information: Array, pull: Array) -> float:
-    """Minus the logarithm of the restricted likelihood, of errors in units of their sigmas."""
-    L = np.linalg.cholesky(np.eye(len(pull)) + information)
-    y = scipy.linalg.solve_triangular(L, pull, lower=True)
-    return float(np.log(np.diag(L)).sum() - 0.5 * y @ y)
+def _costs_of(information: Array, pull: Array, sigmas: Array) -> Array:
+    """(...) minus the logarithms of the restricted likelihood, of errors with sigmas (..., B)."""
+    own = np.eye(len(pull)) + sigmas[..., :, None] * information * sigmas[..., None, :]
+    L, pulls = np.linalg.cholesky(own), sigmas * pull
+    moved = np.linalg.solve(own, pulls[..., None])[..., 0]
+    size = np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
+    return np.asarray(size - 0.5 * (pulls * moved).sum(axis=-1))

@@ -8,7 +8,7 @@ a cloud is tried at several places on the shape of the others; the best explanat
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -260,17 +260,20 @@ def _missing(clouds: CloudStack, mixture: Mixture, R: Array, t: Array) -> Array:
         normals = mixture.normals_target @ R[j]
         range_m = np.linalg.norm(means, axis=1)
         facing = -np.einsum("ka,ka->k", normals, means) / range_m > FACING
-        own, shape = _directions(points), _directions(means)
-        spacing = _spacing(own)
-        apart = np.abs(shape[:, None] - own[None]) / spacing
-        near = apart.max(axis=2) <= BEAMS_APART
-        depth = np.linalg.norm(points, axis=1)[None] - range_m[:, None]
+        own, shape = _directions(points), _directions(means)[facing]
+        weights, spacing = mixture.weights[facing], _spacing(own)
+        # Azimuth and elevation (k, n) apart: numpy is slow along an axis of two.
+        off = [shape[:, None, axis] - own[None, :, axis] for axis in (0, 1)]
+        apart = [np.abs(of_axis) for of_axis in off]
+        beside = [of / one <= BEAMS_APART for of, one in zip(apart, spacing, strict=True)]
+        near = beside[0] & beside[1]
+        depth = np.linalg.norm(points, axis=1)[None] - range_m[facing, None]
         occluded = (near & (depth < -BEHIND_M)).any(axis=1)
         returned = (near & (np.abs(depth) <= BEHIND_M)).any(axis=1)
-        called = facing & ~occluded & _within(shape, own, spacing)
-        expected = float(mixture.weights[called].sum())
+        called = ~occluded & _within(off, apart, spacing)
+        expected = float(weights[called].sum())
         if expected > 0.0:
-            lacking = float(mixture.weights[called & ~returned].sum())
+            lacking = float(weights[called & ~returned].sum())
             out[j] = len(points) * lacking / expected
     return out
 
@@ -292,12 +295,14 @@ def _spacing(directions: Array) -> Array:
     return np.array([max(column, 1e-4), row])
 
 
-def _within(shape: Array, own: Array, spacing: Array) -> BoolArray:
-    """(K,) which directions of a shape have directions (n, 2) of a cloud on all four sides."""
-    inside = np.ones(len(shape), dtype=bool)
+def _within(off: Sequence[Array], apart: Sequence[Array], spacing: Array) -> BoolArray:
+    """(k,) which directions of a shape have directions of a cloud on all four sides.
+
+    `off` are the differences (k, n) of all from all along either angle, `apart` their sizes.
+    """
+    inside = np.ones(len(off[0]), dtype=bool)
     for axis in (0, 1):
-        off = shape[:, None, axis] - own[None, :, axis]
-        level = np.abs(shape[:, None, 1 - axis] - own[None, :, 1 - axis])
-        level = level <= BEAMS_APART * spacing[1 - axis]
-        inside &= (level & (off >= 0.0)).any(axis=1) & (level & (off <= 0.0)).any(axis=1)
+        level = apart[1 - axis] <= BEAMS_APART * spacing[1 - axis]
+        inside &= (level & (off[axis] >= 0.0)).any(axis=1)
+        inside &= (level & (off[axis] <= 0.0)).any(axis=1)
     return np.asarray(inside)

@@ -68,8 +68,15 @@ def test_an_arc_as_json() -> None:
     assert found["status"] == "partial"
 
 
-def test_an_arc_in_words() -> None:
-    result = plan(ARC)
+@pytest.fixture(scope="module")
+def suggested(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
+    """What `plan` says of the arc, and the suggestion that it writes."""
+    out = tmp_path_factory.mktemp("plan") / "suggested.yaml"
+    return plan(ARC, "--out", out), out
+
+
+def test_an_arc_in_words(suggested: tuple[Result, Path]) -> None:
+    result, _ = suggested
 
     assert result.exit_code == 0
     assert "Remedy: change the curvature while the target is in view" in result.stdout
@@ -91,7 +98,8 @@ def test_limits_that_no_drive_keeps_end_after_every_candidate() -> None:
 
 
 def test_sigmas_asked_for_and_not_kept_are_exit_3() -> None:
-    result = plan(ARC, "--sigma", "s2v_yaw_deg=0.05", "--sigma", "s2s_x_m=0.01")
+    limits = ("--sigma", "s2v_yaw_deg=0.05", "--sigma", "s2s_x_m=0.01")
+    result = plan(ARC, "--no-structure", *limits)
 
     assert result.exit_code == 3
     assert "The drive does not keep the limits: s2v_yaw_deg 0.05, s2s_x_m 0.01." in result.stdout
@@ -125,7 +133,7 @@ def test_two_drives_together(tmp_path: Path) -> None:
     world["objects"]["chair"]["xy_m"] = [15.16, 9.16]
     left = changed(tmp_path, name="left.yaml", drive=drive, world=world)
 
-    found = document(ARC, left)
+    found = document(ARC, left, "--no-structure")
 
     assert found["observability"]["undetermined"] == []
     assert len(found["drives"]) == 2
@@ -147,11 +155,8 @@ def test_a_standing_vehicle() -> None:
     assert "figure-eight" in result.stdout
 
 
-def test_the_suggestion_as_a_scenario(tmp_path: Path) -> None:
-    out = tmp_path / "suggested.yaml"
-
-    first = plan(ARC, "--out", out)
-
+def test_the_suggestion_as_a_scenario(suggested: tuple[Result, Path]) -> None:
+    first, out = suggested
     assert first.exit_code == 0
     assert load_scenario(out).drive.kind == "s_curve"
     again = document(out)
@@ -159,7 +164,7 @@ def test_the_suggestion_as_a_scenario(tmp_path: Path) -> None:
     before = out.read_text()
     assert run(["plan", str(ARC), "--out", str(out)]) == 2
     assert out.read_text() == before
-    assert plan(ARC, "--out", out, "--force").exit_code == 0
+    assert plan(ARC, "--no-structure", "--out", out, "--force").exit_code == 0
 
 
 def test_a_lidar_that_sees_nothing_is_exit_3(tmp_path: Path) -> None:
@@ -167,7 +172,7 @@ def test_a_lidar_that_sees_nothing_is_exit_3(tmp_path: Path) -> None:
     lidars["blind"] = dict(lidars["front"], max_range_m=3.0)
     path = changed(tmp_path, lidars=lidars)
 
-    result = plan(path, "--json")
+    result = plan(path, "--no-structure", "--json")
 
     assert result.exit_code == 3
     assert "lidar 'blind' never sees a target" in result.stderr
@@ -210,6 +215,7 @@ def test_a_recorded_drive_and_the_next_one(recorded: Path, tmp_path: Path) -> No
 def test_limits_and_ground_are_those_of_the_config(recorded: Path, tmp_path: Path) -> None:
     raw = yaml.safe_load(recorded.read_text())
     raw |= {"limits": {"s2v_yaw_deg": 0.05}, "ground": {"use": False}}
+    raw["structure"] = {"use": False}
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(raw))
 

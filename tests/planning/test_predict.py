@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -178,11 +179,15 @@ TABLE: dict[str, tuple[set[str], set[str], set[str]]] = {
 COUNTS = {"standstill": (6, 6, 5)}
 GROUNDS: tuple[Ground, ...] = ("none", "plane", "height")
 
+BY_PLANES = Assumptions(structure=False)
+"""Ground by planes; cell by cell, which takes longer, it is tested in test_structure.py."""
 
+
+@cache
 def planned(name: str, ground: Ground, **changes: Any) -> Prediction:
-    """By ground planes; ground cell by cell is tested in test_structure.py."""
+    """One of the drives, by ground planes."""
     first, *others = DRIVES[name]
-    assumptions = Assumptions(ground=ground, ranges=EXACT, structure=False)
+    assumptions = replace(BY_PLANES, ground=ground, ranges=EXACT)
     return predict(first, others, replace(assumptions, **changes))
 
 
@@ -322,8 +327,9 @@ def test_range_biases_lift_the_ground_of_each_lidar() -> None:
 def test_twice_the_noise_of_everything_is_twice_the_sigma() -> None:
     # Along what is determined; floors of the registration are left out by few points.
     scenario = DRIVES["figure-eight"][0]
-    quiet = predict(noiseless(scenario), assumptions=Assumptions(ground="plane"))
-    loud = predict(scenario, assumptions=Assumptions(ground="plane"))
+    by_planes = replace(BY_PLANES, ground="plane")
+    quiet = predict(noiseless(scenario), assumptions=by_planes)
+    loud = predict(scenario, assumptions=by_planes)
 
     assert all((loud.sigma_s2v[n] >= quiet.sigma_s2v[n]).all() for n in loud.sigma_s2v)
     assert loud.sigma_s2v["front"][2] > 1.5 * quiet.sigma_s2v["front"][2]
@@ -377,7 +383,7 @@ def test_the_order_of_the_lidars_changes_nothing() -> None:
 def test_two_drives_tell_more_than_either() -> None:
     both = planned("left arc, right arc", "height")
     for single in DRIVES["left arc, right arc"]:
-        alone = predict(single)
+        alone = predict(single, assumptions=replace(BY_PLANES, ranges=EXACT))
         information = both.covariance.information_data - alone.covariance.information_data
         assert np.linalg.eigvalsh(information).min() > -1e-3 * np.trace(information)
     assert both.duration_s == pytest.approx(34.0)
@@ -412,8 +418,9 @@ def test_where_imu_and_antenna_sit_hardly_matters_if_it_is_known() -> None:
     )
     gnss = scenario.gnss.model_copy(update={"lever_arm": (-0.6, 0.2, 1.6)})
 
-    one = predict(scenario)
-    other = predict(scenario.model_copy(update={"imu": imu, "gnss": gnss}))
+    one = predict(scenario, assumptions=BY_PLANES)
+    moved = scenario.model_copy(update={"imu": imu, "gnss": gnss})
+    other = predict(moved, assumptions=BY_PLANES)
 
     for name in one.sigma_s2v:
         assert other.sigma_s2v[name] == pytest.approx(one.sigma_s2v[name], rel=0.1)
@@ -434,7 +441,7 @@ def test_a_clock_on_an_arc_is_its_x_and_yaw() -> None:
     drive = Drive(evenly(26.0), BOUND_DRIVES["arc"].curvature, 2.8)
 
     without, freed = (
-        predict_drives([(rolling, drive)], Assumptions(time_offset=asked))
+        predict_drives([(rolling, drive)], replace(BY_PLANES, time_offset=asked))
         for asked in (False, True)
     )
     eight = planned("figure-eight", "height", time_offset=True)
@@ -484,8 +491,8 @@ def test_the_yaw_of_a_round_target_is_unobservable() -> None:
     scenario = DRIVES["figure-eight"][0]
     world = WorldModel(objects={"pole": PoleModel(xy_m=(12.08, 0.0))}, targets=("pole",))
 
-    prediction = predict(scenario.model_copy(update={"world": world}))
-    chair = predict(scenario)
+    prediction = predict(scenario.model_copy(update={"world": world}), assumptions=BY_PLANES)
+    chair = predict(scenario, assumptions=BY_PLANES)
 
     assert any("'pole' is symmetric about its axis" in line for line in prediction.warnings)
     # Its place at many distances still does.
@@ -513,10 +520,11 @@ def test_opposite_sides_of_the_target_are_warned_of() -> None:
         for name, lidar in scenario.lidars.items()
     }
 
-    prediction = predict(scenario.model_copy(update={"lidars": narrow}))
+    past = scenario.model_copy(update={"lidars": narrow})
+    warned, silent = (predict(s, assumptions=BY_PLANES).warnings for s in (past, DRIVES["arc"][0]))
 
-    assert any("from sides at least" in line for line in prediction.warnings)
-    assert not any("from sides at least" in line for line in predict(DRIVES["arc"][0]).warnings)
+    assert any("from sides at least" in line for line in warned)
+    assert not any("from sides at least" in line for line in silent)
 
 
 def test_a_target_out_of_reach_is_an_error_with_the_next_step() -> None:

@@ -18,7 +18,7 @@ from tests.kept import KeptDrive
 
 SCENARIOS = Path(__file__).resolve().parents[1] / "configs" / "scenarios"
 
-SPEED_M_S = 3.0
+SPEED_M_S, RADIUS_M = 3.0, 6.0
 GNSS_LATE_S, IMU_LATE_S, POSES_LATE_S = 0.025, 0.008, 0.012
 
 
@@ -28,7 +28,7 @@ def figure_eight() -> KeptDrive:
 
 
 def few_clouds() -> Scenario:
-    """The figure-eight in two thirds of its time, with every fourth of its clouds."""
+    """A figure-eight in half of its time, with every fourth of its clouds."""
     scenario = load_scenario(SCENARIOS / "figure_eight.yaml")
     lidars = {
         name: lidar.model_copy(update={"rate_hz": 10 / 4})
@@ -36,7 +36,7 @@ def few_clouds() -> Scenario:
     }
     assert scenario.crop is not None
     crop = scenario.crop.model_copy(update={"elsewhere_stride": 32})
-    drive = scenario.drive.model_copy(update={"speed_m_s": SPEED_M_S})
+    drive = scenario.drive.model_copy(update={"speed_m_s": SPEED_M_S, "radius_m": RADIUS_M})
     return scenario.model_copy(update={"drive": drive, "lidars": lidars, "crop": crop})
 
 

@@ -30,8 +30,8 @@ from tests.kept import KeptDrive
 
 MM, MRAD = 1e-3, 1e-3
 
-RIGHT = ArcDrive(duration_s=14.0)
-LEFT = ArcDrive(duration_s=14.0, turn="left")
+RIGHT = ArcDrive(duration_s=10.0, speed_m_s=3.0)
+LEFT = ArcDrive(duration_s=10.0, speed_m_s=3.0, turn="left")
 
 CHAIR = {"chair": ChairModel(xy_m=(15.16, -9.16), yaw_deg=90.0)}
 CHAIR_LEFT = {"chair": ChairModel(xy_m=(15.16, 9.16), yaw_deg=-120.0)}
@@ -44,7 +44,7 @@ TWO_CHAIRS = {
 def lidar(x_m: float, yaw_deg: float, y_m: float = 0.0) -> LidarModel:
     return LidarModel(
         mounting=PoseConfig(xyz=(x_m, y_m, 2.0), rpy_deg=(0.0, 10.0, yaw_deg)),
-        rate_hz=2.0,
+        rate_hz=2.5,
         channels=90,
         horizontal_resolution_deg=0.3,
     )

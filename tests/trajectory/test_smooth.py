@@ -46,7 +46,7 @@ AWKWARD = replace(
     force_bias=(0.1, -0.05, 0.08),
     gyro_bias=(0.01, -0.008, 0.012),
     gnss_delay_s=0.033,
-    twist_hz=50.0,
+    twist_hz=20.0,
     twist_delay_s=0.017,
 )
 """IMU and antenna off the origin, biases, and no two sensors at the same instant."""

@@ -202,7 +202,7 @@ def test_drives_and_results_behind_urls(
         {"name": "mon", "config": str(fleet / "mon/config.yaml"), "data": drive},
     )
     out = tmp_path / "store/fleet"
-    first = batch(manifest, "--out", out.as_uri(), "--workers", 1)
+    first = called("batch", manifest, "--out", out.as_uri(), "--workers", 1)
 
     assert first.returncode == 0, first.stderr
     assert f"see {out.as_uri()}/index.html" in first.stdout
@@ -242,7 +242,7 @@ def test_what_is_done_is_not_done_again_and_what_has_changed_is(
         {"name": "mon", "config": "mon/config.yaml", "limits": {"s2v_yaw_deg": 1e-3}},
         {"name": "tue", "config": "tue/config.yaml", "data": "nowhere"},
     )
-    third = batch(changed, "--out", out, "--json", "--workers", 1)
+    third = called("batch", changed, "--out", out, "--json", "--workers", 1)
     assert third.returncode == 3
     mon, tue = json.loads(third.stdout)["jobs"]
     assert (mon["exit"], mon["reused"]) == (3, False)
@@ -281,7 +281,7 @@ def test_interrupted_killed_and_resumed_it_ends_the_same(
     wait_for(lambda: not alive(worker))
     assert (out / ".work").exists(), "it was killed at work"
 
-    last = batch(*arguments)
+    last = called("batch", *arguments)
 
     assert (last.returncode, last.stderr) == (0, "")
     assert not (out / ".work").exists()

@@ -294,8 +294,8 @@ def test_joint_agrees_on_sensor_to_sensor(sparse: Tried) -> None:
 
 
 @pytest.fixture(scope="module")
-def staged(quiet: list[Tried]) -> Tried:
-    return try_out(quiet[0].drive.asked(solve=SolveConfig(mode="staged"), registration=MEDIUM))
+def staged(sparse: Tried) -> Tried:
+    return try_out(sparse.drive.asked(solve=SolveConfig(mode="staged")))
 
 
 def test_staged_is_as_good_as_the_paper_between_sensors(staged: Tried) -> None:

@@ -82,9 +82,9 @@ class Drive:
         parts = []
         if self.ground and lidar != self.blind:  # dense near the LiDAR, about its own place
             _, t = self.way.poses_at([stamp])
-            range_m, angle = rng.uniform(2.0, 12.0, 3000), rng.uniform(-math.pi, math.pi, 3000)
+            range_m, angle = rng.uniform(2.0, 12.0, 1500), rng.uniform(-math.pi, math.pi, 1500)
             flat = np.column_stack([range_m * np.cos(angle), range_m * np.sin(angle)])
-            parts.append(np.column_stack([t[0, :2] + flat, np.zeros(3000)]))
+            parts.append(np.column_stack([t[0, :2] + flat, np.zeros(1500)]))
         if self.posts:
             angle, height = rng.uniform(-math.pi, math.pi, 60), rng.uniform(0.0, 2.0, 60)
             ring = np.column_stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), height])

@@ -41,7 +41,7 @@ def config_of(guesses: bool = True, **sections: Any) -> Config:
     return Config.model_validate({**known, **sections})
 
 
-def room(seconds: float = 8.0, **changes: Any) -> RoomDrive:
+def room(seconds: float = 6.5, **changes: Any) -> RoomDrive:
     return RoomDrive(TRUTH, s_curve(seconds), **changes)
 
 

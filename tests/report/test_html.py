@@ -42,7 +42,7 @@ from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.simulate import write_drive
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from tests.drives_with_chair import paper_scenario, simulated, without_structure
+from tests.drives_with_chair import QUICK, paper_scenario, simulated, without_structure
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -88,7 +88,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """An arc from raw sensors, and a LiDAR with a bad name that never sees the target."""
     folder = tmp_path_factory.mktemp("bag") / "arc"
     scenario = load_scenario(ROOT / "configs/scenarios/demo_arc.yaml")
-    slow = {n: m.model_copy(update={"rate_hz": 2.0}) for n, m in scenario.lidars.items()}
+    slow = {n: m.model_copy(update={"rate_hz": 1.25}) for n, m in scenario.lidars.items()}
     write_drive(scenario.model_copy(update={"lidars": slow}), folder, 1, threads=1)
     config = without_structure(load_config(folder / "config.yaml"))
     blind = config.lidars["front"].model_copy(update={"min_range": 400.0, "max_range": 450.0})
@@ -102,7 +102,7 @@ def staged(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     scenario = paper_scenario(rate_hz=2.0, position_sigma_m=0.005, rotation_sigma_rad=1e-3)
     drive = simulated(scenario, 1, tmp_path_factory.mktemp("caliv") / "arc")
     config = drive.config.model_copy(
-        update={"solve": SolveConfig(mode="staged"), "registration": REGISTRATION}
+        update={"solve": SolveConfig(mode="staged"), "registration": QUICK}
     )
     progress = SilentProgress()
     return Ran(calibrate([drive.recording], config, progress), config, progress.stages)

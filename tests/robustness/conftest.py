@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.robustness.hostile_drives import command, simulate
+from tests.robustness.hostile_drives import command, simulate, write_config
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
@@ -34,7 +34,9 @@ def result(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A calibration of the small drive: never to be written to."""
 
     def calibrate(out: Path) -> None:
-        done = command("calibrate", drive / "config.yaml", "--out", out)
+        # Structure is not the subject of those who read it: a third of the time.
+        alone = write_config(drive, out.with_suffix(".yaml"), structure={"use": False})
+        done = command("calibrate", alone, "--out", out)
         assert done.code == 0, done.err
 
     return made_once(tmp_path_factory, "result", calibrate)

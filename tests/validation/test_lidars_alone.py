@@ -69,7 +69,7 @@ def few_points() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def found() -> Validation:
     """Stamps of their own; the calibration is right in S2S alone."""
-    drive = room(phase_s={"b": 0.05})
+    drive = room(6.5, phase_s={"b": 0.05})
     return validate(drive, calibration(), config_of(), SilentProgress())
 
 

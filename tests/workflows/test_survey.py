@@ -84,6 +84,7 @@ def extracted(name: str) -> Extracted:
     return Extracted(config, prepared)
 
 
+@functools.cache
 def surveyed(name: str, ground: Ground, registration: RegistrationConfig = QUICK) -> Survey:
     drive = extracted(name)
     settings = {

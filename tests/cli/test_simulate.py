@@ -11,7 +11,7 @@ from caliv_graph.cli.main import app
 from caliv_graph.config.load import load_config
 from caliv_graph.errors import ConfigError, OutputError
 from caliv_graph.results.truth_file import read_truth
-from tests.cli.commands import run
+from tests.cli.commands import called, run
 
 SCENARIO = """\
 name: tiny
@@ -129,12 +129,12 @@ def test_as_a_shell_sees_it(scenario: Path, tmp_path: Path) -> None:
     done = run("simulate", scenario, "--out", tmp_path / "out", "--format", "caliv")
     assert (done.returncode, done.stderr) == (0, "")
 
-    again = run("simulate", scenario, "--out", tmp_path / "out")
+    again = called("simulate", scenario, "--out", tmp_path / "out")
     assert again.returncode == 2
     assert again.stderr.startswith("error: ")
     assert again.stderr.count("\n") == 1
 
-    negative = run("simulate", scenario, "--out", tmp_path / "other", "--seed", "-1")
+    negative = called("simulate", scenario, "--out", tmp_path / "other", "--seed", "-1")
     assert negative.returncode == 2
     assert "seed: must be 0 or a positive whole number" in negative.stderr
     assert not (tmp_path / "other").exists()

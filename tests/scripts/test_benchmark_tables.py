@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,10 @@ def test_other_systems_are_compared_by_root_sum_square() -> None:
 # ------------------------------------------------------------------ files
 
 
+planned_once = cache(benchmark.planned)
+"""What `plan` predicts of a scenario: every summary shows it."""
+
+
 @pytest.fixture
 def done(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Seeds that were run; runs themselves are made up."""
@@ -167,6 +172,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[int]:
             raise ZeroDivisionError("a defect")
         return Outcome({"S2V front": ONE}, "ok", (), {"total": 1.0})
 
+    monkeypatch.setattr(benchmark, "planned", planned_once)
     monkeypatch.setattr(benchmark, "run_row", run)
     monkeypatch.setattr(benchmark, "_selection", lambda *_: None)
     monkeypatch.setattr(benchmark, "ThinnedRecording", lambda *_, **__: None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ bias of a LiDAR are hard to tell apart."""
 WITHOUT_HEIGHT = [0, 1, 2, 3, 4]
 
 
+@cache
 def solved(seed: int, bias_m: float, stated_m: float | None) -> Solved:
     positions, yaws = figure_eight(TURN)
     problem = problem_of(yard(), (positions[:POSES], yaws[:POSES]), seed, Noise(bias_m=bias_m))

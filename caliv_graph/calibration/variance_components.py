@@ -31,9 +31,6 @@ PROJECTED_SLOPE = (0.05, 1e-3)
 """Largest derivative by a logarithm that is not at its bound at which the optimiser has arrived, to
 a hundredth of the log-likelihood; and exactly."""
 
-NEWTON_SLOPE = 1e-4
-"""The same of Newton's method: its last steps take most of the slope away."""
-
 TIME_STEP = 1e-2
 """Change of the logarithm of a correlation time by which its derivative is taken."""
 
@@ -300,7 +297,7 @@ def maximise(
         exactly: to where rounding does not matter any more, in twice the time; else to a hundredth
             of the log-likelihood.
         curved: gives a curvature (k, k), too. For starts that are near: Newton's method then takes
-            a third of the time, and ends nearer to the maximum.
+            a fifth of the time.
     """
     centre = np.log([u.median for u in unknowns])
     spread = np.array([u.spread for u in unknowns])
@@ -314,7 +311,7 @@ def maximise(
             value += 0.5 * float(surprise @ surprise)
             return value, slope + surprise / spread, curvature + np.diag(spread**-2.0)
 
-        arrived = _by_newton(posterior, np.log(start), bounds)
+        arrived = _by_newton(posterior, np.log(start), bounds, slope_at_end)
         if arrived is not None:
             return np.exp(arrived[0]), arrived[1]
     first = cost(np.log(start))[0]
@@ -330,7 +327,7 @@ def maximise(
         np.log(start),
         jac=True,
         method="L-BFGS-B",
-        bounds=[(low, high) for low, high in bounds.tolist()],
+        bounds=bounds,
         options={
             "ftol": 1e-10 if exactly else 1e-7,
             "gtol": slope_at_end,
@@ -344,6 +341,7 @@ def _by_newton(
     curved: Callable[[Array], tuple[float, Array, Array]],
     start: Array,
     bounds: Array,
+    slope_at_end: float,
 ) -> tuple[Array, float] | None:
     """The minimum (k,) within bounds (k, 2) near a start, and the value; None: it is not near.
 
@@ -356,7 +354,7 @@ def _by_newton(
     for _ in range(NEWTON_STEPS):
         held = (low == high) | ((x <= low) & (slope > 0.0)) | ((x >= high) & (slope < 0.0))
         free = np.flatnonzero(~held)
-        if np.abs(slope[free]).max(initial=0.0) < NEWTON_SLOPE:
+        if np.abs(slope[free]).max(initial=0.0) < slope_at_end:
             return x, value
         B = _learned(curvature, pairs)[np.ix_(free, free)]
         step = np.zeros(len(x))

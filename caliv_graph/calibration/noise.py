@@ -232,9 +232,7 @@ def expected_noise(
     for row, time in enumerate(times_s.tolist()):
         parts = [Component(part, (number,)) for number, part in enumerate((*white, *slow(time)))]
         likelihood = Likelihood(observed, [*parts, *of_clouds])
-        # Of the times after the first, the most likely values of the one before are near.
-        curved = likelihood.curved if row else None
-        found, cost = maximise(likelihood.cost, unknowns, found, exactly=True, curved=curved)
+        found, cost = maximise(likelihood.cost, unknowns, found, exactly=True)
         surprise = math.log(time / TYPICAL.drift_time_s) / TIME_SPREAD
         costs[row], variances[row] = cost + 0.5 * surprise**2, found[:scale] ** 2
     weight = np.exp(costs.min() - costs)

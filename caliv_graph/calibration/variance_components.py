@@ -15,22 +15,6 @@ from caliv_graph.products import Array
 MAX_STEPS = 100
 """Of the optimiser; fifteen to forty do."""
 
-NEWTON_STEPS = 20
-"""Of Newton's method at most, from where it begins near: six to thirteen do."""
-
-LARGEST_STEP = 1.0
-"""Of a logarithm in one such step: farther away the curvature is another one."""
-
-LEARNED_STEP = 0.3
-"""Largest of these steps from which the curvature is learned."""
-
-HALVINGS = 3
-"""Of a step that does not lead down."""
-
-PROJECTED_SLOPE = (0.05, 1e-3)
-"""Largest derivative by a logarithm that is not at its bound at which the optimiser has arrived, to
-a hundredth of the log-likelihood; and exactly."""
-
 TIME_STEP = 1e-2
 """Change of the logarithm of a correlation time by which its derivative is taken."""
 
@@ -50,39 +34,6 @@ class Block:
 
 Part = Array | Block
 """Errors of one sigma: the (N, N) covariance that they have at sigma 1, or a block of it."""
-
-
-IMPOSSIBLE = 1e12
-"""Minus the log-likelihood where it cannot be computed."""
-
-
-@dataclass(frozen=True)
-class _Weighted:
-    """Residuals weighted by their covariance, the parameters integrated out.
-
-    Attributes:
-        value: minus the log-likelihood.
-        inverse: (N, N) of the covariance.
-        half: (p, N) `inverse - half^T half` is that without what the parameters explain.
-        y: (N,) the residuals times that.
-    """
-
-    value: float
-    inverse: Array
-    half: Array
-    y: Array
-
-    def slope(self, parts: Sequence[Part]) -> Array:
-        """(k,) derivatives of the value by half the variance of each part."""
-        taken = np.vstack([self.half, self.y])
-        by_covariance = self.inverse - taken.T @ taken
-        out = np.empty(len(parts))
-        for i, part in enumerate(parts):
-            if isinstance(part, Block):
-                out[i] = np.vdot(by_covariance[part.rows, part.rows], part.cov)
-            else:
-                out[i] = np.vdot(by_covariance, part)
-        return out
 
 
 @dataclass(frozen=True)
@@ -116,44 +67,26 @@ class Observed:
 
         Patterson & Thompson (1971).
         """
-        found = self._at(parts, logarithms)
-        if found is None:
-            return IMPOSSIBLE, np.zeros(len(logarithms))
-        return found.value, np.exp(2.0 * logarithms) * found.slope(parts)
-
-    def curved(self, parts: Sequence[Part], logarithms: Array) -> tuple[float, Array, Array]:
-        """`cost`, and the curvature (k, k) of the mean of observed and expected information.
-
-        Both differ in a trace that costs as much as all the rest and is not in their mean (Gilmour,
-        Thompson & Cullis 1995). It is positive semidefinite.
-        """
-        found, k = self._at(parts, logarithms), len(logarithms)
-        if found is None:
-            return IMPOSSIBLE, np.zeros(k), np.zeros((k, k))
-        moves = np.zeros((k, len(self.residuals)))
-        for move, variance, part in zip(moves, np.exp(2.0 * logarithms), parts, strict=True):
-            if isinstance(part, Block):
-                move[part.rows] = variance * (part.cov @ found.y[part.rows])
-            else:
-                move[:] = variance * (part @ found.y)
-        along = moves @ found.half.T
-        curvature = 2.0 * (moves @ found.inverse @ moves.T - along @ along.T)
-        return found.value, np.exp(2.0 * logarithms) * found.slope(parts), curvature
-
-    def _at(self, parts: Sequence[Part], logarithms: Array) -> _Weighted | None:
-        """None where rounding leaves the covariance singular."""
         V = self.covariance(parts, logarithms)
         try:
             L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
         except scipy.linalg.LinAlgError:
-            return None
+            return 1e12, np.zeros(len(logarithms))
         inverse = _inverse(L)
         weighted = inverse @ self.design
         LN = scipy.linalg.cholesky(self.design.T @ weighted + np.diag(self.ridge), lower=True)
         half = scipy.linalg.solve_triangular(LN, weighted.T, lower=True)
         y = inverse @ self.residuals - half.T @ (half @ self.residuals)
         value = np.log(np.diag(L)).sum() + np.log(np.diag(LN)).sum() + 0.5 * self.residuals @ y
-        return _Weighted(float(value), inverse, half, y)
+        taken = np.vstack([half, y])
+        by_covariance = inverse - taken.T @ taken
+        slope = np.empty(len(parts))
+        for i, part in enumerate(parts):
+            if isinstance(part, Block):
+                slope[i] = np.vdot(by_covariance[part.rows, part.rows], part.cov)
+            else:
+                slope[i] = np.vdot(by_covariance, part)
+        return float(value), np.exp(2.0 * logarithms) * slope
 
     def value(self, parts: Sequence[Part], logarithms: Array) -> float:
         """Minus the log-likelihood as `cost` has it, in a third of the time."""
@@ -161,7 +94,7 @@ class Observed:
         try:
             L = scipy.linalg.cholesky(V, lower=True, check_finite=False)
         except scipy.linalg.LinAlgError:
-            return IMPOSSIBLE
+            return 1e12
         both = np.column_stack([self.design, self.residuals])
         white = scipy.linalg.solve_triangular(L, both, lower=True, check_finite=False)
         A, r = white[:, :-1], white[:, -1]
@@ -231,13 +164,6 @@ class Likelihood:
             slope[of.time] += (changed - value) / TIME_STEP
         return value, slope
 
-    def curved(self, x: Array) -> tuple[float, Array, Array]:
-        """`cost`, and a curvature (k, k) as `Observed.curved` has it; no times may be unknown."""
-        products = self._products(len(x))
-        parts, logarithms = self._errors(x, [])
-        value, by_part, curvature = self.observed.curved(parts, logarithms)
-        return value, by_part @ products, products.T @ curvature @ products
-
     def _slow_parts(self, x: Array) -> list[Sequence[Array]]:
         return [of.parts(math.exp(x[of.time])) for of in self.slow]
 
@@ -286,7 +212,6 @@ def maximise(
     start: Array,
     *,
     exactly: bool = False,
-    curved: Callable[[Array], tuple[float, Array, Array]] | None = None,
 ) -> tuple[Array, float]:
     """The most likely values (k,) under their priors, and minus the logarithm of both there.
 
@@ -296,24 +221,9 @@ def maximise(
         start: (k,) values.
         exactly: to where rounding does not matter any more, in twice the time; else to a hundredth
             of the log-likelihood.
-        curved: gives a curvature (k, k), too. For starts that are near: Newton's method then takes
-            a fifth of the time.
     """
     centre = np.log([u.median for u in unknowns])
     spread = np.array([u.spread for u in unknowns])
-    bounds = np.log([u.bounds for u in unknowns])
-    slope_at_end = PROJECTED_SLOPE[exactly]
-    if curved is not None:
-
-        def posterior(x: Array) -> tuple[float, Array, Array]:
-            value, slope, curvature = curved(x)
-            surprise = (x - centre) / spread
-            value += 0.5 * float(surprise @ surprise)
-            return value, slope + surprise / spread, curvature + np.diag(spread**-2.0)
-
-        arrived = _by_newton(posterior, np.log(start), bounds, slope_at_end)
-        if arrived is not None:
-            return np.exp(arrived[0]), arrived[1]
     first = cost(np.log(start))[0]
 
     def penalised(x: Array) -> tuple[float, Array]:
@@ -327,58 +237,11 @@ def maximise(
         np.log(start),
         jac=True,
         method="L-BFGS-B",
-        bounds=bounds,
+        bounds=[tuple(np.log(u.bounds)) for u in unknowns],
         options={
             "ftol": 1e-10 if exactly else 1e-7,
-            "gtol": slope_at_end,
+            "gtol": 1e-3 if exactly else 0.05,
             "maxiter": MAX_STEPS,
         },
     )
     return np.exp(np.asarray(found.x)), float(found.fun) + first
-
-
-def _by_newton(
-    curved: Callable[[Array], tuple[float, Array, Array]],
-    start: Array,
-    bounds: Array,
-    slope_at_end: float,
-) -> tuple[Array, float] | None:
-    """The minimum (k,) within bounds (k, 2) near a start, and the value; None: it is not near.
-
-    `curved` gives value, slope (k,) and positive definite curvature (k, k).
-    """
-    low, high = bounds.T
-    x = np.clip(start, low, high)
-    value, slope, curvature = curved(x)
-    pairs: list[tuple[Array, Array]] = []
-    for _ in range(NEWTON_STEPS):
-        held = (low == high) | ((x <= low) & (slope > 0.0)) | ((x >= high) & (slope < 0.0))
-        free = np.flatnonzero(~held)
-        if np.abs(slope[free]).max(initial=0.0) < slope_at_end:
-            return x, value
-        B = _learned(curvature, pairs)[np.ix_(free, free)]
-        step = np.zeros(len(x))
-        step[free] = -np.linalg.solve(B, slope[free])
-        step *= min(1.0, LARGEST_STEP / float(np.abs(step).max()))
-        for _ in range(HALVINGS):
-            after = np.clip(x + step, low, high)
-            found = curved(after)
-            if found[0] < value:
-                break
-            step = 0.5 * step
-        if not found[0] < value:
-            return None
-        if np.abs(after - x).max() < LEARNED_STEP:
-            pairs.append((after - x, found[1] - slope))
-        x, (value, slope, curvature) = after, found
-    return None
-
-
-def _learned(curvature: Array, pairs: Sequence[tuple[Array, Array]]) -> Array:
-    """(k, k) curvature that agrees with steps (k,) and changes of the slope (k,) by them (BFGS)."""
-    B = curvature
-    for step, change in pairs:
-        along = B @ step
-        if (bent := float(step @ change)) > 0.0:
-            B = B + np.outer(change, change) / bent - np.outer(along, along) / (step @ along)
-    return B

@@ -155,7 +155,7 @@ def drive(draws: Draws, course: Course, ground: Ground, body: Body) -> Motion:
     forward, lateral = np.gradient(speed, STEP_S), speed**2 * course.curvature
     xy, yaw = course.xy_m, course.yaw_rad
     if draws.on("slip"):
-        yaw = yaw + body.slip_gain_rad * gaussian_filter1d(lateral, 0.1 / STEP_S)
+        yaw = yaw + body.slip_gain_rad * gaussian_filter1d(np.sign(speed) * lateral, 0.1 / STEP_S)
     ahead = np.column_stack([np.cos(yaw), np.sin(yaw)])
     left = np.column_stack([-np.sin(yaw), np.cos(yaw)])
 

@@ -40,7 +40,7 @@ from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetCloud, TargetObservation
 from caliv_graph.targets.cloud.views import views
 from caliv_graph.trajectory.noise import given_pose_covariances
-from caliv_graph.trajectory.rates import rate_rows_of_drives, turn_densities
+from caliv_graph.trajectory.rates import rate_rows_of_drives, turn_variances
 from caliv_graph.trajectory.select import (
     GivenTrajectory,
     VehicleTrajectory,
@@ -428,10 +428,13 @@ def _given_rates(
 def _turns(
     clouds: Sequence[tuple[int, TargetCloud]], smoothed: Mapping[int, SmoothedTrajectory]
 ) -> Array:
-    """`Problem.cloud_turn_rad`: a gyroscope's angle walks at random."""
-    density = {drive: turn_densities(trajectory) for drive, trajectory in smoothed.items()}
-    nothing = np.zeros(3)
-    variance = [abs(c.apart_s) * density.get(c.drive, nothing) for _, c in clouds]
+    """`Problem.cloud_turn_rad`: a gyroscope's angle walks, rates without one err."""
+    by_drive = {drive: turn_variances(trajectory) for drive, trajectory in smoothed.items()}
+    nothing = np.zeros(3), np.zeros(3)
+    variance = []
+    for _, c in clouds:
+        walk, constant = by_drive.get(c.drive, nothing)
+        variance.append(abs(c.apart_s) * walk + c.apart_s**2 * constant)
     return np.sqrt(np.array(variance).reshape(-1, 3))
 
 

@@ -43,6 +43,7 @@ def collecting_what_is_new() -> Iterator[None]:
     if gc.get_freeze_count():
         yield
         return
+    gc.collect()  # garbage that is frozen would stay, run after run
     gc.freeze()
     try:
         yield

@@ -1,8 +1,8 @@
 """Errors of the angular velocity within sweeps: white noise of the gyroscope (`README.md`, 6b).
 
-Points taken tau after the stamp are moved there by the gyroscope, whose angle walks at random: all
-strips that a scan sees are turned by as much, in proportion to their times. LiDARs that sweep
-together turn alike.
+Points taken tau after the stamp are moved there by the gyroscope, whose angle walks at random, or
+by rates that nothing measures: all strips that a scan sees are turned by as much, in proportion to
+their times. LiDARs that sweep together turn alike.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.patches import DrivePatches
-from caliv_graph.trajectory.rates import turn_densities
+from caliv_graph.trajectory.rates import turn_variances
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -30,4 +30,5 @@ def turn_sigmas(
     np.maximum.at(longest, number.ravel()[patches.scan], np.abs(patches.time_s))
     # The angle has the variance q tau; a constant error w of the rate makes it w^2 tau^2. Over 0 to
     # T their means are the same at w^2 = 3 q / (2 T).
-    return np.asarray(np.sqrt(1.5 * turn_densities(trajectory) / longest[:, None]))
+    walk, constant = turn_variances(trajectory)
+    return np.asarray(np.sqrt(1.5 * walk / longest[:, None] + constant))

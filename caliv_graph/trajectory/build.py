@@ -26,7 +26,7 @@ from caliv_graph.trajectory.factors import (
     velocity_factor,
 )
 from caliv_graph.trajectory.imu import DeadReckoning, preintegrate
-from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.inputs import IMU_CLOCK, SmootherInput
 from caliv_graph.trajectory.measurements import NodeOrientations, NodePositions, NodeVelocities
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.states import States, without_bias
@@ -236,7 +236,9 @@ def _add_level(
     assert data.wheels is not None
     assert data.motion.twist is not None
     up_map = normal_of(data.slope)
-    leaning = data.lean * accelerations(data.motion.twist, nodes, dead)
+    R_wheels_twist = data.T_vehicle_imu.between(data.T_vehicle_twist).rotation().matrix()
+    late_ns = data.late_ns.get(IMU_CLOCK, 0)
+    leaning = data.lean * accelerations(data.motion.twist, nodes, dead, R_wheels_twist, late_ns)
     for i, sigma in enumerate(level_sigmas(nodes, data.wheels).tolist()):
         noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
         graph.add("level", level_factor(key_imu(i), up_map, leaning[i], noise))

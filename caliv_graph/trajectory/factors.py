@@ -317,7 +317,8 @@ class Gaussian:
                 blocks.append(np.eye(len(mean)))
         if self.chart is not None:
             of_poses = [isinstance(mean, gtsam.Pose3) for mean in self.means]
-            found = iter(self.chart.derivatives(np.array(list(compress(apart, of_poses)))))
+            moved = np.array(list(compress(apart, of_poses))).reshape(-1, 6)
+            found = iter(self.chart.derivatives(moved))
             others = iter(blocks)
             blocks = [next(found if is_pose else others) for is_pose in of_poses]
         d = np.concatenate(apart)

@@ -216,7 +216,8 @@ def velocities_at_nodes(
     measured = twist.velocity[usable]
     if slip_s2_m:
         measured = measured.copy()
-        measured[:, 1] -= slip_s2_m * measured[:, 0] ** 2 * (rates @ R_imu_twist)[:, 2]
+        ahead = measured[:, 0]
+        measured[:, 1] -= slip_s2_m * np.abs(ahead) * ahead * (rates @ R_imu_twist)[:, 2]
     at_imu = measured @ R_imu_twist.T - scale * cross(rates, arm)
     sample_s = float(np.median(np.diff(dead.stamps_ns))) * 1e-9
     arm_cross = np.cross(np.eye(3), arm)

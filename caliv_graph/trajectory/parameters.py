@@ -173,7 +173,7 @@ AXLE_SLIP = InputParameter(
     "wheels.slip", ("value",), "s^2/m", np.full(1, 1e-3), frozenset({"velocity"}), _slip_moved
 )
 """Side slip of an axle per lateral acceleration, to the outside of a curve: how soft its tyres are.
-At a constant speed it is as if the axle were `slip v^2` ahead of where it is."""
+At a constant speed it is as if the axle were `slip v^2` further in the direction of travel."""
 
 LEAN = InputParameter(
     "wheels.lean",
@@ -240,7 +240,9 @@ IMU_TIME_OFFSET = InputParameter(
 """The same of the IMU, its orientations with it. Nodes and their poses stay in the clock of the
 LiDARs."""
 
-WHEELS_TIME_OFFSET = replace(IMU_TIME_OFFSET, name="twist.time_offset")
+WHEELS_TIME_OFFSET = replace(
+    IMU_TIME_OFFSET, name="twist.time_offset", kinds=IMU_TIME_OFFSET.kinds | {"level"}
+)
 """The same of wheels without an IMU, whose odometry stands in for it."""
 
 HEADING_YAW = InputParameter(

@@ -132,7 +132,16 @@ def with_rates(information: Array, gradient: Array, rows: Array) -> tuple[Array,
     return out, np.concatenate([gradient, np.zeros(RATES)])
 
 
-def turn_densities(trajectory: SmoothedTrajectory) -> Array:
-    """(3,) rad^2/s, vehicle axes: variance per second of what the gyroscope errs over a sweep."""
+def turn_variances(trajectory: SmoothedTrajectory) -> tuple[Array, Array]:
+    """How the angular velocity errs within a sweep, along the vehicle's axes.
+
+    (3,) rad^2/s, variance per second of an angle that walks at random, and (3,) rad^2/s^2, variance
+    of a constant error: without an IMU nothing measures how fast the body rolls and pitches.
+    """
     R = trajectory.T_vehicle_imu.rotation().matrix()
-    return np.asarray(np.diag(R @ trajectory.data.noise.gyro_density @ R.T))
+    noise = trajectory.data.noise
+    steady = np.zeros(3)
+    if trajectory.data.wheels is not None:
+        steady[:2] = noise.gyro_bias[:2] ** 2
+    white, constant = (R @ of @ R.T for of in (noise.gyro_density, np.diag(steady)))
+    return np.asarray(np.diag(white)), np.asarray(np.diag(constant))

@@ -247,10 +247,25 @@ def level_sigmas(nodes_ns: IntArray, model: WheelModel) -> Array:
     return np.asarray(np.sqrt(density / node_spans_s(nodes_ns)))
 
 
-def accelerations(twist: TwistSamples, nodes_ns: IntArray, dead: DeadReckoning) -> Array:
-    """(n, 2) m/s^2 ahead and to the left at the nodes, over half a second; `dead` has the rates."""
+def accelerations(
+    twist: TwistSamples,
+    nodes_ns: IntArray,
+    dead: DeadReckoning,
+    R_wheels_twist: Array,
+    late_ns: int = 0,
+) -> Array:
+    """(n, 2) m/s^2 of the axle ahead and to the left at the nodes, over half a second.
+
+    Args:
+        twist: velocities in axes of their own.
+        nodes_ns: (n,) stamps.
+        dead: the axle's rates.
+        R_wheels_twist: (3, 3) from those axes.
+        late_ns: the stamps of the velocities less the true times.
+    """
     usable = np.isfinite(twist.velocity).all(axis=1)
-    stamps, speeds = np.asarray(twist.stamps_ns)[usable], twist.velocity[usable, :1]
+    stamps = np.asarray(twist.stamps_ns, np.int64)[usable] - late_ns
+    speeds = twist.velocity[usable] @ R_wheels_twist[:1].T
     begin, end = (np.clip(nodes_ns + shift, stamps[0], stamps[-1]) for shift in (-LEAN_NS, LEAN_NS))
     before, after = (interpolate(at, stamps, speeds)[:, 0] for at in (begin, end))
     ahead = (after - before) / ((end - begin) * 1e-9)

@@ -52,11 +52,13 @@ def ring():
     return weakref.ref(Ring())
 
 gc.disable()
-old = ring()
+dead, kept = ring(), Ring()
+old = weakref.ref(kept)
 with collecting_what_is_new():
     new = ring()
+    del kept
     gc.collect()
-    print(old() is None, new() is None)
+    print(dead() is None, old() is None, new() is None)
 gc.collect()
 print(old() is None, gc.get_freeze_count())
 """
@@ -66,7 +68,7 @@ def test_collections_pass_over_what_is_there_until_the_end() -> None:
     done = subprocess.run(
         [sys.executable, "-c", PASSED_OVER], capture_output=True, text=True, check=True
     )
-    assert done.stdout.split() == ["False", "True", "True", "0"]
+    assert done.stdout.split() == ["True", "False", "True", "True", "0"]
 
 
 def test_what_a_caller_has_frozen_stays_so() -> None:

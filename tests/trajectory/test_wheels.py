@@ -19,8 +19,10 @@ from caliv_graph.scenario.drives import Drive
 from caliv_graph.trajectory.heading import heading_disagreement
 from caliv_graph.trajectory.imu import DeadReckoning
 from caliv_graph.trajectory.inputs import check_input
+from caliv_graph.trajectory.measurements import velocities_at_nodes
 from caliv_graph.trajectory.parameters import SPEED_POINT
 from caliv_graph.trajectory.physics import motion_physics
+from caliv_graph.trajectory.rates import turn_variances
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.uncertain import AXLE_SLIP_SIGMA
@@ -135,13 +137,47 @@ def test_an_axle_that_slips_in_curves_is_no_axle_elsewhere() -> None:
     assert abs(slips[0]) < 2.0 * sigmas[0]
 
 
+@pytest.mark.parametrize("speed", [2.0, -2.0])
+def test_an_axle_slips_to_the_outside_forwards_and_backwards(speed: float) -> None:
+    # A circle to the left or, backwards, with the wheels to the left: its centre is on the left.
+    rate, softness = speed / 5.0, 0.005
+    at = START_NS + 10_000_000 * np.arange(300)
+    none = np.zeros((len(at), 3))
+    dead = DeadReckoning(at, np.tile([0.0, 0.0, rate], (len(at), 1)), none)
+    odometry = TwistSamples(at[5:-5], np.tile([speed, 0.0, 0.0], (290, 1)))
+    cov = np.tile(np.eye(3), (290, 1, 1))
+    noise = wheel_noise(odometry, settings())
+    lateral = []
+    for slip in (0.0, softness):
+        found = velocities_at_nodes(
+            odometry, cov, at[50:-50:10], dead, noise, gtsam.Pose3(), slip_s2_m=slip
+        )
+        assert found is not None
+        lateral.append(found.velocity_imu[:, 1])
+    # 0.8 m/s^2 to the left: 4 mrad of 2 m/s to the right.
+    assert lateral[1] - lateral[0] == pytest.approx(-0.008, rel=1e-3)
+
+
+def test_rates_of_roll_and_pitch_err_by_what_the_springs_allow() -> None:
+    _, found = smoothed(True)
+    white, constant = turn_variances(found)
+    model = found.data.wheels
+    assert model is not None
+    assert np.sqrt(constant[:2]) == pytest.approx(np.sqrt(2.0) * model.tilt_rad)
+    # Nothing measures them: what is known of them at a node is little more.
+    assert np.median(found.bias_sigmas()[1][:, :2], axis=0).min() > 0.5 * np.sqrt(constant[0])
+    # The yaw rate is that of the odometry.
+    assert constant[2] < 1e-4 * constant[0]
+    assert white[2] > 0.0
+
+
 def test_accelerations_are_those_ahead_and_into_the_curve() -> None:
     motion = wheels(1)
     data, _ = check_input(motion, settings())
     assert motion.twist is not None
     nodes = stamps(DRIVE.duration_s, 10.0, 0.5)
     dead = DeadReckoning(data.inertial.stamps_ns, data.inertial.gyro, data.inertial.force)
-    found = accelerations(motion.twist, nodes, dead)
+    found = accelerations(motion.twist, nodes, dead, np.eye(3))
     truth = DRIVE.at(seconds(nodes))
     speed = np.linalg.norm(truth.velocity_map, axis=1)
     steady = speed > 1.99
@@ -149,6 +185,15 @@ def test_accelerations_are_those_ahead_and_into_the_curve() -> None:
     left = SCALE * speed * (truth.rates[:, 2] + 0.004)
     assert np.ptp(left[steady]) > 0.8
     assert np.abs(found[steady, 1] - left[steady]).max() < 0.04
+    # In axes turned to the left by a right angle; stamps that are late by a second are not.
+    y_ahead = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = replace(
+        motion.twist,
+        velocity=motion.twist.velocity @ y_ahead,
+        stamps_ns=motion.twist.stamps_ns + 1_000_000_000,
+    )
+    same = accelerations(turned, nodes, dead, y_ahead, 1_000_000_000)
+    assert np.abs(same - found).max() < 1e-9
     # 2 m/s within seconds, and back.
     ahead = SCALE * np.gradient(speed, seconds(nodes))
     assert np.ptp(ahead) > 2.0

@@ -268,7 +268,8 @@ def accelerations(
     speeds = twist.velocity[usable] @ R_wheels_twist[:1].T
     begin, end = (np.clip(nodes_ns + shift, stamps[0], stamps[-1]) for shift in (-LEAN_NS, LEAN_NS))
     before, after = (interpolate(at, stamps, speeds)[:, 0] for at in (begin, end))
-    ahead = (after - before) / ((end - begin) * 1e-9)
+    # Beyond the velocities, where a late clock leaves nodes without any, they are held.
+    ahead = (after - before) / (np.maximum(end - begin, 1) * 1e-9)
     rates = dead.rates(nodes_ns, LEAN_NS)[:, 2]
     return np.column_stack([ahead, 0.5 * (before + after) * rates])
 

@@ -194,6 +194,9 @@ def test_accelerations_are_those_ahead_and_into_the_curve() -> None:
     )
     same = accelerations(turned, nodes, dead, y_ahead, 1_000_000_000)
     assert np.abs(same - found).max() < 1e-9
+    late = accelerations(motion.twist, nodes, dead, np.eye(3), 1_000_000_000)
+    assert late[-1, 0] == 0.0
+    assert np.isfinite(late).all()
     # 2 m/s within seconds, and back.
     ahead = SCALE * np.gradient(speed, seconds(nodes))
     assert np.ptp(ahead) > 2.0

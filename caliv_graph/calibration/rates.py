@@ -16,10 +16,10 @@ from caliv_graph.calibration.ground_factors import moved
 from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND, key_rates, key_vehicle
-from caliv_graph.geometry.se3 import turned_twist, unstack
+from caliv_graph.geometry.se3 import turned_twist
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.trajectory.rates import RATE_SIGMAS, RATES
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import VehicleTrajectory, mean_twists
 
 
 def swept_drives(problem: Problem, grounds: Sequence[GroundObservation]) -> list[int]:
@@ -61,11 +61,8 @@ def _twists_in_sweeps(
     first, last = np.array([o.taken_s for o in observations]).T * NANOSECONDS_PER_SECOND
     offsets = np.round([np.minimum(first, 0.0), np.maximum(last, 0.0)]).astype(np.int64)
     stamps = np.array([o.stamp_ns for o in observations], dtype=np.int64)
-    ends = np.clip(stamps + offsets, *trajectory.span_ns)
-    poses = unstack(*trajectory.poses_at(ends.ravel()))
-    seconds = np.maximum(ends[1] - ends[0], 1) / NANOSECONDS_PER_SECOND
-    steps = zip(poses[: len(stamps)], poses[len(stamps) :], seconds, strict=True)
-    return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])
+    begin, end = np.clip(stamps + offsets, *trajectory.span_ns)
+    return mean_twists(trajectory, begin, end)
 
 
 def rates_graph(problem: Problem, grounds: Sequence[GroundObservation]) -> CalibrationGraph:

@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import compress
 
 import gtsam
 import numpy as np
@@ -308,6 +307,7 @@ class Gaussian:
                     blocks.append(gtsam.Pose3.LogmapDerivative(T))
                 else:
                     apart.append(self.chart.coordinates(T))
+                    blocks.append(np.empty((6, 6)))  # all at once, below
             elif isinstance(mean, gtsam.Rot3):
                 turn = gtsam.Rot3.Logmap(mean.between(values.atRot3(key)))
                 apart.append(turn)
@@ -316,11 +316,10 @@ class Gaussian:
                 apart.append(values.atVector(key) - mean)
                 blocks.append(np.eye(len(mean)))
         if self.chart is not None:
-            of_poses = [isinstance(mean, gtsam.Pose3) for mean in self.means]
-            moved = np.array(list(compress(apart, of_poses))).reshape(-1, 6)
-            found = iter(self.chart.derivatives(moved))
-            others = iter(blocks)
-            blocks = [next(found if is_pose else others) for is_pose in of_poses]
+            poses = [k for k, mean in enumerate(self.means) if isinstance(mean, gtsam.Pose3)]
+            moved = np.array([apart[k] for k in poses]).reshape(-1, 6)
+            for k, block in zip(poses, self.chart.derivatives(moved), strict=True):
+                blocks[k] = block
         d = np.concatenate(apart)
         H = _by_blocks(blocks, _by_blocks(blocks, self.information).T)
         b = _by_blocks(blocks, (self.gradient - self.information @ d)[:, None])[:, 0]

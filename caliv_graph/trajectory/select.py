@@ -196,11 +196,22 @@ def accelerations_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) ->
 
 def twists_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:
     """(m, 6) velocity of the vehicle at some stamps, a right perturbation per second."""
-    before, after, seconds = _windows(trajectory, stamps_ns)
+    before, after, _ = _windows(trajectory, stamps_ns)
+    return mean_twists(trajectory, before, after)
+
+
+def mean_twists(trajectory: VehicleTrajectory, begin_ns: IntArray, end_ns: IntArray) -> Array:
+    """(m, 6) mean velocity of the vehicle between stamps, a right perturbation per second."""
     # Together: a call takes most of its time whatever it is asked for.
-    poses = unstack(*trajectory.poses_at(np.concatenate([before, after])))
-    steps = zip(poses[: len(before)], poses[len(before) :], seconds, strict=True)
+    poses = unstack(*trajectory.poses_at(np.concatenate([begin_ns, end_ns])))
+    seconds = _seconds(begin_ns, end_ns)
+    steps = zip(poses[: len(seconds)], poses[len(seconds) :], seconds, strict=True)
     return np.array([gtsam.Pose3.Logmap(a.between(b)) / s for a, b, s in steps])
+
+
+def _seconds(begin_ns: IntArray, end_ns: IntArray) -> Array:
+    """(m,) from one stamp to another, a nanosecond at least."""
+    return np.asarray(np.maximum(end_ns - begin_ns, 1) / NANOSECONDS_PER_SECOND)
 
 
 def _windows(
@@ -212,4 +223,4 @@ def _windows(
     stamps = np.asarray(stamps_ns, dtype=np.int64)
     before = np.maximum(stamps - half_ns, begin)
     after = np.minimum(stamps + half_ns, end)
-    return before, after, np.maximum((after - before) / NANOSECONDS_PER_SECOND, 1e-9)
+    return before, after, _seconds(before, after)

@@ -110,8 +110,9 @@ def _candidates(
         {name: [] for name in wanted} for _ in extractors
     ]
     for name, stamps in wanted.items():
-        for extractor in extractors if stamps else ():
-            extractor.look_up(name, stamps)
+        if stamps:
+            for extractor in extractors:
+                extractor.look_up(name, stamps)
         for scan in recording.scans(name, stamps):
             for extractor, of_lidar in zip(extractors, seen, strict=True):
                 of_lidar[name].append(extractor.candidates(scan, drive))

@@ -37,6 +37,7 @@ from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.solve import GATES_M, Solved
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.thickness import plane_rows, thickness_m, weighted_alike
+from caliv_graph.structure.tilts import USUAL_RAD
 
 OWN_SIGHTINGS = 3
 """Fewest sightings of a strip with which a LiDAR's distance is measured."""
@@ -125,8 +126,15 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
     least = 0.5 * usual
     sighting = np.sqrt(np.maximum((OWN_STRIP * usual**2 + total) / (OWN_STRIP + count), least**2))
     strip = np.full(strips.count, np.median(used.nuisances.strip))
-    bend = np.where(strips.level, *used.levels().bend_per_m)
-    nuisances = replace(used.nuisances, sighting=sighting, strip=strip, bend=bend)
+    levels = used.levels()
+    nuisances = replace(
+        used.nuisances,
+        sighting=sighting,
+        sighting_tilt=sighting * np.where(strips.level, *levels.tilt_per_m),
+        strip=strip,
+        strip_tilt=np.where(strips.level, *(levels.strip_tilt_rad or (USUAL_RAD, USUAL_RAD))),
+        bend=np.where(strips.level, *levels.bend_per_m),
+    )
     weights = robust_weights(own, sightings, nuisances)
     scans = np.zeros((strips.count, layout.lidars), dtype=np.int64)
     np.add.at(scans, (sightings.strip, lidar), weights > 0.0)

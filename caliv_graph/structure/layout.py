@@ -30,6 +30,9 @@ class Nuisances:
         strip: (K,) how far a LiDAR sees each strip from where others do: bumps, other beams.
         bend: (K,) of the bends of each strip, 1/m (`bends.py`); not metres.
         sighting: (K,) offset of each strip from scan to scan.
+        sighting_tilt: (K,) tilt of each strip from scan to scan, rad; not metres.
+        strip_tilt: (K,) tilt that a LiDAR sees each strip have in all scans against what others
+            see, rad; not metres.
         shared: offset of a surface from scan to scan, which its strips share: incidence, and how
             the beams fall, change along a wall slowly.
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
@@ -46,6 +49,8 @@ class Nuisances:
     surface: float
     strip: Array
     sighting: Array
+    sighting_tilt: Array
+    strip_tilt: Array
     shared: float
     repeated: float
     beams: Array = field(default_factory=lambda: np.zeros(0))

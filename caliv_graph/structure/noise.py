@@ -14,10 +14,12 @@ from caliv_graph.config.range_errors import RangeErrors, SizePrior, log_normal, 
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import BeamErrors, mean_rows, parts_of
 from caliv_graph.structure.bends import BENDS, USUAL_PER_M
+from caliv_graph.structure.heavy_tails import FREEDOM, heavy_tailed
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
-from caliv_graph.structure.patches import DrivePatches, along_surface
+from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.tilts import fitted_tilts, lengths_m, tilts_of
 from caliv_graph.structure.views import Views
 
 FIRST_SIGHTING_M = 0.01
@@ -45,11 +47,9 @@ LEAST_RANGE_M = 1e-3
 OWN_STRIP = 10.0
 """Number of sightings that the common sigma counts as when the sigma of one strip is estimated."""
 
-STRIP_FREEDOM = 4.0
-"""Degrees of freedom of the distribution of how far LiDARs see a strip apart: heavy tails."""
-
 STRIP_USUAL_M = 0.003
-"""Its sigma where nothing tells, which counts as one strip: roughness of the surface."""
+"""1 sigma of how far a LiDAR sees a strip from where others do where nothing tells, which counts as
+one strip: roughness of the surface."""
 
 ONE_VIEW_M = 0.005
 """Smallest sigma of a strip where every LiDAR has one place only: what its beams get wrong there by
@@ -76,10 +76,6 @@ LEAST_BEND_PER_M, MOST_BEND_PER_M = 2e-4, 0.1
 SPREADS = (3.0, 6.0)
 """Offset of a sighting in sigmas up to which it has full weight, and from which it has none; and
 its tilt, of ground."""
-
-STEEPEST_RAD = 1.0
-"""Prior of the tilt of a sighting: points on a line do not tell it."""
-
 
 LEAST_JITTER_S = 1e-5
 MOST_JITTER_S = 0.02
@@ -157,7 +153,7 @@ def tilt_weights(geometry: Geometry, sightings: Sightings, level: BoolArray) -> 
     own = level[sightings.strip]
     if not own.any():
         return out
-    tilts, variances = _tilts(sightings, geometry, own)
+    tilts, variances = tilts_of(sightings, geometry, own)
     common = _common_sigma(tilts.ravel(), variances.ravel(), 1.0)
     out[own] = _falling((np.abs(tilts) / np.sqrt(variances + common**2)).max(axis=1, initial=0.0))
     return out
@@ -167,26 +163,6 @@ def _falling(t: Array) -> Array:
     """(Q,) weights by numbers of sigmas (Q,)."""
     low, high = SPREADS
     return np.clip((high - t) / (high - low), 0.0, 1.0)
-
-
-def _tilts(sightings: Sightings, geometry: Geometry, own: BoolArray) -> tuple[Array, Array]:
-    """Tilts (n, 2) of the points of some sightings to their plane, rad; variances by their noise.
-
-    Without what the noise of the points makes of them: a LiDAR on the bumper has patches of 4 cm
-    that rise by 20 mrad, by noise alone. Two of five lost their weight, and those that were left
-    were the ones whose noise happened to turn them the other way. By the moments as they are,
-    noise included: tilts are too small by its share of these, a seventh for 4 cm and 10 mm.
-    """
-    moments, noise = sightings.moments[own], sightings.noise[own]
-    N = along_surface(moments, geometry.normals_lidar[own])
-    of_points = np.swapaxes(N, 1, 2)
-    cov = np.linalg.inv(
-        of_points @ moments @ N + np.diag([0.0, STEEPEST_RAD**-2.0, STEEPEST_RAD**-2.0])
-    )
-    told = np.einsum("qij,qj->qi", moments, geometry.plain[own])
-    told -= np.einsum("qij,qj->qi", noise, geometry.placed[own])
-    fitted = np.einsum("qij,qjk,qk->qi", cov, of_points, told)
-    return fitted[:, 1:], np.diagonal(cov, axis1=1, axis2=2)[:, 1:]
 
 
 def _variances(sightings: Sightings, sigma_m: Array) -> Array:
@@ -199,6 +175,7 @@ def fitted_noise(
     before: Geometry,
     sightings: Sightings,
     group: IntArray,
+    lidar: IntArray,
     views: Views,
     weights: Array,
     solve: Callable[[Array], Array],
@@ -208,6 +185,7 @@ def fitted_noise(
     errors: Array,
     ranges: RangeErrors,
     level: BoolArray,
+    tilts: bool,
 ) -> Nuisances:
     """Noise levels from the residuals at an estimate (REML: what was fitted is counted).
 
@@ -217,6 +195,7 @@ def fitted_noise(
             that it does not determine, such as a turn of everything about a standing vehicle.
         sightings: Q of them.
         group: (Q,) a number for scan and surface of each.
+        lidar: (Q,) index of the LiDAR of each.
         views: which scans are from one place.
         weights: (Q,) robust, of the system that was solved.
         solve: gives H^-1 times some columns (D, ...) of the system that was solved.
@@ -246,16 +225,29 @@ def fitted_noise(
     one = len(np.unique(views.of_scan)) <= layout.lidars
     view = views.of_scan[sightings.scan] * layout.strips + sightings.strip
     again = _shared_variance(np.clip(offsets, -limit, limit), view) / free
+    strip = np.maximum(
+        _strip_sigmas(asked, layout, nuisances.strip, errors), ONE_VIEW_M if one else LEAST_M
+    )
+    sighting = np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2))
+    if one:
+        own_tilt = sighting / lengths_m(level)
+        strip_tilt = ONE_VIEW_M / lengths_m(level)
+    elif not tilts:
+        own_tilt, strip_tilt = sighting / lengths_m(level), strip / lengths_m(level)
+    else:
+        known = nuisances.sighting_tilt, nuisances.strip_tilt
+        own_tilt, strip_tilt = fitted_tilts(
+            sightings, geometry, lidar, weights, level, sighting, known
+        )
     return replace(
         nuisances,
-        sighting=np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2)),
+        sighting=sighting,
+        sighting_tilt=own_tilt,
+        strip_tilt=strip_tilt,
         shared=math.sqrt(shared),
         bias=_bias_sigma(asked, layout, nuisances.bias, errors, ranges),
         surface=_surface_sigma(asked, layout, nuisances.surface, errors, ranges.surface_m),
-        strip=np.maximum(
-            _strip_sigmas(asked, layout, nuisances.strip, errors),
-            ONE_VIEW_M if one else LEAST_M,
-        ),
+        strip=strip,
         repeated=1.0 if one else float(np.clip(again / (common**2 + shared), 0.0, 1.0)),
         beams=_beam_sigmas(covariance, layout, nuisances.beams, errors, ranges),
         bend=_bend_sigmas(asked, layout, nuisances.bend, errors, level, one),
@@ -448,7 +440,7 @@ def beam_sigmas(
             cov, error = joint[at, at], found[at]
             common = _common_size(cov, error, sigma[at], priors[kind])
             share = np.clip(1.0 - np.diag(cov) / sigma[at] ** 2, 0.0, 1.0)
-            variance = (STRIP_FREEDOM * common**2 + error**2) / (STRIP_FREEDOM + share)
+            variance = (FREEDOM * common**2 + error**2) / (FREEDOM + share)
             after[at] = np.sqrt(variance)
         sigma = after
     return sigma
@@ -485,7 +477,7 @@ def _strip_sigmas(asked: _Asked, layout: Layout, before: Array, errors: Array) -
     own = slice(layout.strip_error, layout.size)
     known = np.clip(_known(asked, own, before), 0.0, 1.0).sum(axis=0)
     square = (errors[own].reshape(layout.lidars, -1) ** 2).sum(axis=0)
-    return _heavy_tailed(known, square, before, STRIP_USUAL_M, (LEAST_M, MOST_STRIP_M))
+    return heavy_tailed(known, square, before, STRIP_USUAL_M, (LEAST_M, MOST_STRIP_M))
 
 
 def _bend_sigmas(
@@ -509,26 +501,5 @@ def _bend_sigmas(
     out = np.array(before)
     for of in (level, ~level):
         if of.any():
-            out[of] = _heavy_tailed(known[of], square[of], before[of], USUAL_PER_M, limits)
+            out[of] = heavy_tailed(known[of], square[of], before[of], USUAL_PER_M, limits)
     return out
-
-
-def _heavy_tailed(
-    known: Array, square: Array, before: Array, usual: float, limits: tuple[float, float]
-) -> Array:
-    """(K,) sigmas of errors of K strips, each of its own size about a common one.
-
-    Args:
-        known: (K,) how many errors of each the data know.
-        square: (K,) sum of their squares.
-        before: (K,) the sigmas before.
-        usual: what counts as one more error of one more strip.
-        limits: smallest and largest sigma.
-    """
-    least, most = np.square(limits).tolist()
-    middle = float(np.median(before))
-    own_weight = (STRIP_FREEDOM + known) / (STRIP_FREEDOM + square / middle**2)
-    common = (usual**2 + float(own_weight @ square)) / (1.0 + float(known.sum()))
-    common = float(np.clip(common, least, most))
-    out = (STRIP_FREEDOM * common + square) / (STRIP_FREEDOM + known)
-    return np.asarray(np.sqrt(np.clip(out, least, most)))

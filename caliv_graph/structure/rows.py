@@ -86,7 +86,8 @@ def whitened(
     own = nuisances.sighting[sightings.strip] * more
     # A strip that two LiDARs see apart they see tilted against each other, too, and alike in all
     # scans: bumps within it. As often as it is seen, so often the error counts.
-    tilt = np.sqrt(own**2 + (alike - 1.0) * nuisances.strip[sightings.strip] ** 2)
+    own_tilt = nuisances.sighting_tilt[sightings.strip] * more
+    tilt = np.sqrt(own_tilt**2 + (alike - 1.0) * nuisances.strip_tilt[sightings.strip] ** 2)
     S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]
     values, vectors = np.linalg.eigh(S)

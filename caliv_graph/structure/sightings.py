@@ -20,15 +20,6 @@ ROUGHNESS_M = 0.003
 BEAM_RAD = 3e-4
 """1 sigma of the direction of a beam: a tenth of the usual divergence of 3 mrad."""
 
-TILT_LENGTH_M = 1.0
-"""Distance over which the error of a sighting changes by its own sigma: half a strip. How beams
-fall on joints, edges and bumps differs over a strip as much as from scan to scan."""
-
-GROUND_TILT_LENGTH_M = 0.5
-"""The same on ground: the width of a patch. There a patch has three rings, each on bumps of its
-own; tilts of sightings are 2.3 mrad on streets of a simulator where offsets are 0.8 mm."""
-
-
 MIN_COS = GRAZING_COS
 """Smallest cosine of the incidence: beyond, footprints are metres long."""
 
@@ -49,8 +40,6 @@ class Sightings:
         points: (Q,) their number.
         T_vehicle_lidar: of each LiDAR, with which points of other times were moved to the stamps.
         beams: what errors of the beams add; None: they have none.
-        tilt_length_m: (Q,) distance over which the own error of each changes by its sigma; None:
-            `TILT_LENGTH_M`.
         bends: (Q, BENDS, 4) what bends of the strips add (`bends.py`); None: strips are flat.
     """
 
@@ -63,7 +52,6 @@ class Sightings:
     T_vehicle_lidar: tuple[gtsam.Pose3, ...]
     beams: SeenBeams | None = None
     bends: Array | None = None
-    tilt_length_m: Array | None = None
 
     @property
     def count(self) -> int:
@@ -87,7 +75,6 @@ class Sightings:
             points=self.points[keep],
             beams=self.beams and self.beams.only(keep),
             bends=None if self.bends is None else self.bends[keep],
-            tilt_length_m=None if self.tilt_length_m is None else self.tilt_length_m[keep],
         )
 
 
@@ -175,29 +162,24 @@ def sightings_of(
         T_vehicle_lidar=T_vehicle_lidar,
         beams=of_beams,
         bends=bends,
-        tilt_length_m=np.where(
-            strips.level[strips.of_patch[own[starts]]], GROUND_TILT_LENGTH_M, TILT_LENGTH_M
-        ),
     )
 
 
 def without_own_error(
-    sightings: Sightings, normals_lidar: Array, offset_m: Array, tilt_m: Array
+    sightings: Sightings, normals_lidar: Array, offset_m: Array, tilt_rad: Array
 ) -> tuple[Array, Array]:
     """Moments (Q, 4, 4) without the own error of each sighting; and what noise adds.
 
     That error is an offset and two tilts: `S - S N (Sigma^-1 + N^T S N)^-1 N^T S`. However many
     points it has, a sighting knows its strip no better than `offset_m` (Q,) at its middle, and its
-    tilt no better than `tilt_m` (Q,) over `Sightings.tilt_length_m`. `normals_lidar` (Q, 3) at the
+    tilt no better than `tilt_rad` (Q,). `normals_lidar` (Q, 3) at the
     scan's stamp.
     """
     S = sightings.moments
     N = along_surface(S, normals_lidar)
-    length_m = TILT_LENGTH_M if sightings.tilt_length_m is None else sightings.tilt_length_m
-    N[:, :, 1:] /= np.reshape(length_m, (-1, 1, 1))
     SN = S @ N
     inner = np.swapaxes(N, 1, 2) @ SN
-    inner[:, range(3), range(3)] += np.stack([offset_m, tilt_m, tilt_m], axis=1) ** -2.0
+    inner[:, range(3), range(3)] += np.stack([offset_m, tilt_rad, tilt_rad], axis=1) ** -2.0
     K = N @ np.linalg.solve(inner, np.swapaxes(SN, 1, 2))
     left = np.eye(4) - K
     out = S @ left

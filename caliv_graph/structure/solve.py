@@ -12,7 +12,7 @@ import numpy as np
 
 from caliv_graph.common.memory import give_back_freed_memory
 from caliv_graph.config.range_errors import RangeErrors
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import usual_sigmas
 from caliv_graph.structure.bends import USUAL_PER_M
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
@@ -49,6 +49,7 @@ from caliv_graph.structure.thinning import (
     some_scans,
     with_scans,
 )
+from caliv_graph.structure.tilts import FIRST_TILT_PER_M, USUAL_RAD
 
 ROUGH_GATES_M = (0.3, 0.15, 0.08)
 GATES_M = (0.06, 0.06)
@@ -64,6 +65,8 @@ STEPS = (2, LAST_STEPS)
 SMALL_SIGMAS = 0.02
 """Step in standard deviations of the extrinsics at which the solve has converged."""
 
+
+Pair = tuple[float, float]
 
 Clocks = dict[str, tuple[float, float]]
 """LiDAR -> how late its stamps are, and 1 sigma, seconds."""
@@ -110,10 +113,8 @@ class Estimate:
     def levels(self) -> Levels:
         """Its noise levels, for the strips of another round."""
         found = self.nuisances
-        of_kinds = (self.strips.level, ~self.strips.level)
-        ground, others = (
-            float(np.median(found.bend[of])) if of.any() else USUAL_PER_M for of in of_kinds
-        )
+        level = self.strips.level
+        tilt_per_m = found.sighting_tilt / found.sighting
         return Levels(
             sighting_m=float(np.median(found.sighting)),
             strip_m=float(np.median(found.strip)),
@@ -121,7 +122,9 @@ class Estimate:
             surface_m=found.surface,
             bias_m=found.bias,
             beams=found.beams,
-            bend_per_m=(ground, others),
+            bend_per_m=_medians(found.bend, level, (USUAL_PER_M, USUAL_PER_M)),
+            tilt_per_m=_medians(tilt_per_m, level, FIRST_TILT_PER_M),
+            strip_tilt_rad=_medians(found.strip_tilt, level, (USUAL_RAD, USUAL_RAD)),
         )
 
     def stands(self) -> Stands:
@@ -149,8 +152,9 @@ class Solved(Estimate):
 class Levels:
     """Noise levels, alike for all strips, with which a round begins: those of `Nuisances`.
 
-    `beams` is (E,), as of `Nuisances`, or None: as is usual; `bend_per_m` is that of level strips,
-    and of others.
+    `beams` is (E,), as of `Nuisances`, or None: as is usual. Pairs are of level strips, and of
+    others: `bend_per_m`, tilts of sightings in offsets (`tilt_per_m`), and what a LiDAR repeats of
+    tilts (`strip_tilt_rad`; None: as of sightings).
     """
 
     sighting_m: float
@@ -159,12 +163,24 @@ class Levels:
     surface_m: float
     bias_m: float
     beams: Array | None = None
-    bend_per_m: tuple[float, float] = (USUAL_PER_M, USUAL_PER_M)
+    bend_per_m: Pair = (USUAL_PER_M, USUAL_PER_M)
+    tilt_per_m: Pair = FIRST_TILT_PER_M
+    strip_tilt_rad: Pair | None = None
 
     @staticmethod
     def first(sighting_m: float, strip_m: float, shared_m: float, ranges: RangeErrors) -> Levels:
         """Some levels, and what is known of the ranges before any data."""
         return Levels(sighting_m, strip_m, shared_m, ranges.surface_m, ranges.offsets.usual)
+
+
+def _medians(of_strips: Array, level: BoolArray, none: Pair) -> Pair:
+    """Medians of level strips, and of others; where there are no such, that of `none`."""
+    kinds = (level, ~level)
+    ground, others = (
+        float(np.median(of_strips[of])) if of.any() else usual
+        for of, usual in zip(kinds, none, strict=True)
+    )
+    return ground, others
 
 
 def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
@@ -235,7 +251,7 @@ def _rough(
         found = _round(some, rough, range_sigma, gate, levels)
         if found is None:
             break
-        found = _settled(found, steps=2)
+        found = _settled(found, steps=2, tilts=False)
         levels = replace(found.levels(), beams=None, bend_per_m=levels.bend_per_m)
         rough, beam = found.state, found.layout.beam
     if len(rough.errors):
@@ -344,6 +360,10 @@ def _round(
     state = replace(
         state, centres_map=strips.centres_map, normals_map=strips.normals_map, errors=errors
     )
+    tilt_per_m = np.where(strips.level, *levels.tilt_per_m)
+    strip_tilt = levels.strip_m * tilt_per_m
+    if levels.strip_tilt_rad is not None:
+        strip_tilt = np.where(strips.level, *levels.strip_tilt_rad)
     nuisances = Nuisances(
         bias=levels.bias_m,
         incidence=problem.range_errors.incidence_m,
@@ -351,6 +371,8 @@ def _round(
         surface=levels.surface_m,
         strip=np.full(strips.count, levels.strip_m),
         sighting=np.full(strips.count, levels.sighting_m),
+        sighting_tilt=levels.sighting_m * tilt_per_m,
+        strip_tilt=strip_tilt,
         shared=levels.shared_m,
         repeated=0.0,
         beams=usual_sigmas(layout.beams, problem.range_errors)
@@ -366,19 +388,21 @@ def _round(
     )
 
 
-def _settled(found: Estimate, steps: int, first: System | None = None) -> Estimate:
+def _settled(
+    found: Estimate, steps: int, first: System | None = None, tilts: bool = True
+) -> Estimate:
     """Gauss-Newton steps; after each one the noise levels and the robust weights.
 
     `first` is the system of the first step, where there is one.
     """
     for number in range(steps):
-        found, size = _stepped(found, first if number == 0 else None)
+        found, size = _stepped(found, first if number == 0 else None, tilts)
         if number > 0 and size < SMALL_SIGMAS:
             return replace(found, converged=True)
     return replace(found, converged=False)
 
 
-def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
+def _stepped(found: Estimate, system: System | None, tilts: bool) -> tuple[Estimate, float]:
     """The estimate after a step, and the size of the step in sigmas of the extrinsics."""
     problem, layout, sightings = found.problem, found.layout, found.sightings
     system = system or found.linearised()
@@ -391,6 +415,7 @@ def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
         found.geometry,
         sightings,
         groups_of(sightings, found.strips),
+        problem.patches.scan_lidar[sightings.scan],
         problem.views,
         found.weights,
         partial(system.surfaces.solve, factor),
@@ -400,6 +425,7 @@ def _stepped(found: Estimate, system: System | None) -> tuple[Estimate, float]:
         state.errors,
         problem.range_errors,
         found.strips.level,
+        tilts,
     )
     by_offset = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
     weights = np.minimum(by_offset, tilt_weights(geometry, sightings, found.strips.level))

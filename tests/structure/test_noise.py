@@ -18,10 +18,17 @@ from caliv_graph.structure.beams import (
 )
 from caliv_graph.structure.noise import beam_sigmas, range_sigmas, tilt_weights
 from caliv_graph.structure.patches import DrivePatches
-from caliv_graph.structure.residuals import Geometry
+from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings
 
 POINTS = 20
+
+
+def by_tilts(count: int) -> Array:
+    """Derivatives by the tilts of level ground, all others zero."""
+    by = np.zeros((count, PLANE_ROWS.stop, 4))
+    by[:, PLANE_ROWS.start, 0] = by[:, PLANE_ROWS.start + 1, 1] = 1.0
+    return by
 
 
 def patches_of(range_m: float, beam_rad: float, count: int = 3000) -> DrivePatches:
@@ -126,8 +133,8 @@ def test_a_sighting_that_is_tilted_has_no_weight_though_its_middle_is_right() ->
     geometry = Geometry(
         plain=np.column_stack([up, np.full(40, 1.8)]),
         placed=np.zeros((40, 4)),
-        by=np.zeros((40, 0, 4)),
-        columns=np.zeros((40, 0), np.int64),
+        by=by_tilts(40),
+        columns=np.zeros((40, 15), np.int64),
         normals_lidar=up,
     )
     assert np.abs(geometry.offsets_m(sightings)).max() < 0.002
@@ -160,7 +167,7 @@ def test_small_pieces_of_ground_that_noise_tilts_keep_their_weight() -> None:
         of_noise[:3, :3] = weight * range_sigma_m**2 * u.T @ u
     none, up = np.zeros(count, np.int64), np.tile([0.0, 0.0, 1.0], (count, 1))
     plane = np.column_stack([up, np.full(count, 0.6)])
-    geometry = Geometry(plane, plane, np.zeros((count, 0, 4)), np.zeros((count, 0), int), up)
+    geometry = Geometry(plane, plane, by_tilts(count), np.zeros((count, 15), int), up)
     sightings = Sightings(
         none, none, moments, noise, np.zeros(count), np.full(count, float(points)), ()
     )

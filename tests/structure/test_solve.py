@@ -114,7 +114,7 @@ def solved() -> Solved:
 
 def test_a_late_clock_shows_while_it_is_held(solved: Solved) -> None:
     """In curves to both sides no extrinsic makes up for it."""
-    late = solve(problem_of(yard(), figure_eight(16), 1, clock_s=0.02))
+    late = solve(problem_of(yard(), figure_eight(24), 1, clock_s=0.02))
     assert set(late.clocks) == set(solved.clocks) == {"front", "rear"}
     for name, (value_s, sigma_s) in late.clocks.items():
         # One linear step from the wrong extrinsics, on poses 2 m apart.

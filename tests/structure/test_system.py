@@ -72,6 +72,12 @@ def above_ground(layout: Layout, centre_map: np.ndarray) -> State:
     )
 
 
+def of_one_strip(strip_m: float, sighting_m: float, shared_m: float) -> Nuisances:
+    """Noise levels, tilts as offsets over a metre."""
+    strip, own = np.array([strip_m]), np.array([sighting_m])
+    return Nuisances(0.005, 0.003, 0.003, 0.003, strip, own, own, strip, shared_m, 0.0)
+
+
 def geometry_at(state: State, sightings: Sightings, twists: np.ndarray) -> Geometry:
     return geometry_of(state, sightings, LAYOUT, LIDAR, POSE, twists, accelerations=ACCELERATIONS)
 
@@ -289,7 +295,7 @@ def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them()
     h = np.column_stack([p, np.ones(200)])
     layout = Layout(1, 0, (), 1, (0,))
     state = above_ground(layout, np.array([6.0, 0.0, -2.0]))
-    nuisances = Nuisances(0.005, 0.003, 0.003, 0.003, np.array([4e-4]), np.array([2e-4]), 2e-4, 0.0)
+    nuisances = of_one_strip(strip_m=4e-4, sighting_m=2e-4, shared_m=2e-4)
     tilts = slice(layout.plane, layout.plane + 2)
     for count in (50, 200):
         of = np.zeros(count, np.int64)

@@ -1,0 +1,31 @@
+"""Sizes of errors of strips, each of its own size about a common one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caliv_graph.products import Array
+
+FREEDOM = 4.0
+"""Degrees of freedom of the distribution of errors of strips: heavy tails."""
+
+
+def heavy_tailed(
+    known: Array, square: Array, before: Array, usual: float, limits: tuple[float, float]
+) -> Array:
+    """(K,) sigmas of errors of K strips, each of its own size about a common one.
+
+    Args:
+        known: (K,) how many errors of each the data know.
+        square: (K,) sum of their squares.
+        before: (K,) the sigmas before.
+        usual: what counts as one more error of one more strip.
+        limits: smallest and largest sigma.
+    """
+    least, most = np.square(limits).tolist()
+    middle = float(np.median(before))
+    own_weight = (FREEDOM + known) / (FREEDOM + square / middle**2)
+    common = (usual**2 + float(own_weight @ square)) / (1.0 + float(known.sum()))
+    common = float(np.clip(common, least, most))
+    out = (FREEDOM * common + square) / (FREEDOM + known)
+    return np.asarray(np.sqrt(np.clip(out, least, most)))

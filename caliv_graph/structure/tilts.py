@@ -1,0 +1,209 @@
+"""Tilts: how far what a LiDAR shows of a strip is turned against the strip, and how alike.
+
+Walls are plastered, rings fall on joints and bumps, and noise of points turns what is fitted to
+them. A LiDAR's yaw is told by the tilts of walls for the most part, so that their errors have sizes
+of their own: those of offsets per metre say too little.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.heavy_tails import heavy_tailed
+from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
+from caliv_graph.structure.sightings import Sightings
+
+TILT_LENGTH_M = 1.0
+"""Distance over which the error of a sighting changes by its own sigma, to begin with: half a
+strip. How beams fall on joints, edges and bumps differs over a strip as much as from scan to
+scan."""
+
+GROUND_TILT_LENGTH_M = 0.5
+"""The same on ground: the width of a patch. There a patch has three rings, each on bumps of its
+own; tilts of sightings are 2.3 mrad on streets of a simulator where offsets are 0.8 mm."""
+
+FIRST_TILT_PER_M = (1.0 / GROUND_TILT_LENGTH_M, 1.0 / TILT_LENGTH_M)
+"""Tilts of sightings of level strips and of others in their offsets, to begin with."""
+
+SHORTEST_M, LONGEST_M = 0.1, 10.0
+"""Bounds of that distance: a fifth of a patch, and walls as flat as glass."""
+
+USUAL_RAD = 1e-3
+"""1 sigma of what a LiDAR repeats of the tilt of a strip where nothing tells, which counts as one:
+1 mm per metre."""
+
+LEAST_RAD, MOST_RAD = 2e-4, 0.05
+"""Its smallest and largest sigma."""
+
+STEEPEST_RAD = 1.0
+"""Prior of the tilt of a sighting: points on a line do not tell it."""
+
+LEAST_TILTS = 20
+"""Tilts, beyond those of the means, that tell the distance at least."""
+
+ROUNDS = 20
+"""Steps of the likelihood of the sizes, each of which costs next to nothing."""
+
+
+def lengths_m(level: BoolArray) -> Array:
+    """(K,) distance over which the error of a sighting changes by its sigma, to begin with."""
+    return np.where(level, GROUND_TILT_LENGTH_M, TILT_LENGTH_M)
+
+
+def tilts_of(
+    sightings: Sightings, geometry: Geometry, own: BoolArray | IntArray
+) -> tuple[Array, Array]:
+    """Tilts (n, 2) of the points of some sightings to their plane, rad; variances by their noise.
+
+    About the axes of the strips. Without what the noise of the points makes of them: a LiDAR on the
+    bumper has patches of 4 cm that rise by 20 mrad, by noise alone. Two of five lost their weight,
+    and those that were left were the ones whose noise happened to turn them the other way. By the
+    moments as they are, noise included: tilts are too small by its share of these, a seventh for
+    4 cm and 10 mm.
+    """
+    moments, noise = sightings.moments[own], sightings.noise[own]
+    axes = geometry.by[own][:, PLANE_ROWS][:, :2, :3]
+    N = np.zeros((len(moments), 4, 3))
+    N[:, 3, 0] = 1.0
+    N[:, :3, 1:] = np.swapaxes(axes, 1, 2)
+    N[:, 3, 1:] = -np.einsum("qki,qi->qk", axes, sightings.centroids_lidar[own])
+    of_points = np.swapaxes(N, 1, 2)
+    cov = np.linalg.inv(
+        of_points @ moments @ N + np.diag([0.0, STEEPEST_RAD**-2.0, STEEPEST_RAD**-2.0])
+    )
+    told = np.einsum("qij,qj->qi", moments, geometry.plain[own])
+    told -= np.einsum("qij,qj->qi", noise, geometry.placed[own])
+    fitted = np.einsum("qij,qjk,qk->qi", cov, of_points, told)
+    return fitted[:, 1:], np.diagonal(cov, axis1=1, axis2=2)[:, 1:]
+
+
+def fitted_tilts(
+    sightings: Sightings,
+    geometry: Geometry,
+    lidar: IntArray,
+    weights: Array,
+    level: BoolArray,
+    sighting_m: Array,
+    before: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """1 sigma (K,) of the tilt of a sighting of each strip, and of what a LiDAR repeats of it, rad.
+
+    The first in proportion to the sigma of the strip's offset: the scatter of the tilts of one
+    LiDAR on one strip is as expected. The second by how far two LiDARs see a strip tilted against
+    each other, the strip's own tilt left free, with a t distribution as `Nuisances.strip` has.
+    Ground and others apart. A turn of all strips of a scan is none of their errors: a late clock or
+    a pose is what it says something of.
+
+    Args:
+        sightings: Q of them.
+        geometry: residuals at the estimate.
+        lidar: (Q,) index of the LiDAR of each.
+        weights: (Q,) robust.
+        level: (K,) which strips are ground.
+        sighting_m: (K,) 1 sigma of the offset of each sighting.
+        before: both before.
+    """
+    own_rad, repeated = sighting_m / lengths_m(level), np.array(before[1])
+    at = np.flatnonzero(weights > 0.5)
+    if not len(at):
+        return own_rad, repeated
+    tilts, variances = tilts_of(sightings, geometry, at)
+    strip = sightings.strip[at]
+    total = variances + before[0][strip][:, None] ** 2
+    tilts, free = _without_turns(tilts, total, geometry, sightings.scan, at)
+    lidars = int(lidar.max(initial=0)) + 1
+    key = strip * lidars + lidar[at]
+    size = len(level) * lidars
+    for of in (level, ~level):
+        own = of[strip]
+        length_m = _length(tilts[own], variances[own], free[own], key[own], sighting_m[strip[own]])
+        if length_m is not None:
+            own_rad[of] = sighting_m[of] / length_m
+        known, mean = np.zeros((2, size)), np.zeros((2, size))
+        for i in range(2):
+            w = 1.0 / (variances[own, i] + own_rad[strip[own]] ** 2)
+            known[i] = np.bincount(key[own], w, size)
+            mean[i] = np.bincount(key[own], w * tilts[own, i], size)
+        mean /= np.maximum(known, 1e-12)
+        shape = (2, len(level), lidars)
+        if of.any():
+            repeated[of] = _repeated(
+                known.reshape(shape)[:, of], mean.reshape(shape)[:, of], repeated[of]
+            )
+    return own_rad, repeated
+
+
+def _without_turns(
+    tilts: Array, variances: Array, geometry: Geometry, scan: IntArray, at: IntArray
+) -> tuple[Array, Array]:
+    """Tilts (n, 2) without the turn of all strips of a scan; how much of each is left, 0 to 1.
+
+    `scan` (Q,) is that of each sighting, `at` (n,) are those that have the tilts.
+    """
+    axes = geometry.by[at][:, PLANE_ROWS][:, :2, :3]
+    by_turn = np.cross(geometry.normals_lidar[at][:, None], axes)
+    weighted = by_turn / variances[:, :, None]
+    _, number = np.unique(scan[at], return_inverse=True)
+    number = number.ravel()
+    count = int(number.max()) + 1
+    H, g = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    np.add.at(H, number, np.swapaxes(weighted, 1, 2) @ by_turn)
+    np.add.at(g, number, np.einsum("qki,qk->qi", weighted, tilts))
+    cov = np.linalg.inv(H + STEEPEST_RAD**-2.0 * np.eye(3))
+    turn = np.einsum("sij,sj->si", cov, g)[number]
+    taken = np.einsum("qki,qij,qkj->qk", weighted, cov[number], by_turn)
+    return tilts - np.einsum("qki,qi->qk", by_turn, turn), np.clip(1.0 - taken, 0.0, 1.0)
+
+
+def _length(
+    tilts: Array, variances: Array, free: Array, key: IntArray, sigma_m: Array
+) -> float | None:
+    """Distance over which errors of sightings change by their sigma; None where too few tell."""
+    _, number, count = np.unique(key, return_inverse=True, return_counts=True)
+    number = number.ravel()
+    expected = float(free.sum()) - 2.0 * len(count)
+    if expected < LEAST_TILTS:
+        return None
+    low, high = math.log(SHORTEST_M), math.log(LONGEST_M)
+    for _ in range(ROUNDS):
+        middle = 0.5 * (low + high)
+        total = variances + (sigma_m * math.exp(-middle))[:, None] ** 2
+        t = 0.0
+        for i in range(2):
+            w = 1.0 / total[:, i]
+            mean = np.bincount(number, w * tilts[:, i]) / np.bincount(number, w)
+            # Outliers count as three sigmas.
+            t += float(np.minimum(w * (tilts[:, i] - mean[number]) ** 2, 9.0).sum())
+        low, high = (low, middle) if t > expected else (middle, high)
+    return math.exp(0.5 * (low + high))
+
+
+def _repeated(known: Array, mean: Array, before: Array) -> Array:
+    """(K,) sigmas of what each LiDAR repeats of the tilt of each of K strips.
+
+    Args:
+        known: (2, K, L) information of each LiDAR on each of the two tilts, 1/rad^2.
+        mean: (2, K, L) these, rad.
+        before: (K,) the sigmas before.
+    """
+    seen = known > 0.0
+    sigma = before
+    for _ in range(ROUNDS):
+        variance = sigma[None, :, None] ** 2
+        w = np.where(seen, 1.0 / (1.0 / np.where(seen, known, 1.0) + variance), 0.0)
+        total = np.maximum(w.sum(axis=2, keepdims=True), 1e-12)
+        # The strip's own tilt is free.
+        middle = (w * mean).sum(axis=2, keepdims=True) / total
+        errors = variance * w * (mean - middle)
+        told = np.where(seen, variance * w * (1.0 - w / total), 0.0)
+        sigma = heavy_tailed(
+            told.sum(axis=(0, 2)),
+            (errors**2).sum(axis=(0, 2)),
+            sigma,
+            USUAL_RAD,
+            (LEAST_RAD, MOST_RAD),
+        )
+    return sigma

@@ -1,0 +1,100 @@
+"""Tilts of sightings: their noise, and what LiDARs repeat of it, against known sizes."""
+
+import numpy as np
+import pytest
+
+from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
+from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.tilts import USUAL_RAD, fitted_tilts
+
+STRIPS, LIDARS, SCANS = 80, 2, 12
+OFFSET_M, OWN_RAD, REPEATED_RAD = 4e-4, 1.6e-3, 7e-4
+
+
+def seen(
+    lidars: int, odd_rad: float = 0.0, turn_rad: float = 0.0
+) -> tuple[Sightings, Geometry, IntArray]:
+    """Walls at x = 0, each with a tilt of its own that both LiDARs see; and the LiDARs.
+
+    Points of 8 mm, as many as tell a tilt to 0.5 mrad. The first LiDAR sees the first wall
+    `odd_rad` more turned; every scan is turned by some `turn_rad`.
+    """
+    rng = np.random.default_rng(11)
+    strip = np.repeat(np.arange(STRIPS), lidars * SCANS)
+    lidar = np.tile(np.repeat(np.arange(lidars), SCANS), STRIPS)
+    of_strip = 5e-3 * rng.standard_normal((STRIPS, 2))
+    of_lidar = REPEATED_RAD * rng.standard_normal((STRIPS, lidars, 2))
+    of_lidar[0, 0] += odd_rad
+    tilt = of_strip[strip] + of_lidar[strip, lidar] + OWN_RAD * rng.standard_normal((len(strip), 2))
+    scan = np.tile(np.arange(lidars * SCANS), STRIPS)
+    tilt += turn_rad * rng.standard_normal((lidars * SCANS, 2))[scan]
+    y, z = (g.ravel() for g in np.meshgrid(np.linspace(-0.9, 0.9, 15), np.linspace(-0.9, 0.9, 15)))
+    x = (y * tilt[:, :1] + z * tilt[:, 1:]) + 4e-3 * rng.standard_normal((len(strip), len(y)))
+    h = np.stack(np.broadcast_arrays(x, y, z, 1.0), axis=2)
+    moments = np.einsum("qni,qnj->qij", h, h) * 4e-3**-2.0
+    count = len(strip)
+    plain = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    by = np.zeros((count, PLANE_ROWS.stop, 4))
+    by[:, PLANE_ROWS.start, 1] = by[:, PLANE_ROWS.start + 1, 2] = 1.0
+    columns = np.zeros(by.shape[:2], np.int64)
+    geometry = Geometry(plain, plain, by, columns, plain[:, :3])
+    points = np.full(count, float(len(y)))
+    nothing = np.zeros_like(moments)
+    sightings = Sightings(scan, strip, moments, nothing, np.zeros(count), points, ())
+    return sightings, geometry, lidar
+
+
+def fitted(lidars: int, odd_rad: float = 0.0, turn_rad: float = 0.0) -> tuple[Array, Array]:
+    sightings, geometry, lidar = seen(lidars, odd_rad, turn_rad)
+    offset = np.full(STRIPS, OFFSET_M)
+    walls, before = np.zeros(STRIPS, np.bool_), (np.full(STRIPS, 1e-3), np.full(STRIPS, 4e-4))
+    weights = np.ones(sightings.count)
+    return fitted_tilts(sightings, geometry, lidar, weights, walls, offset, before)
+
+
+def test_the_noise_of_tilts_and_what_lidars_repeat_are_told_apart() -> None:
+    own, repeated = fitted(LIDARS)
+    assert own == pytest.approx(OWN_RAD, rel=0.05)
+    assert np.sqrt(np.mean(repeated**2)) == pytest.approx(REPEATED_RAD, rel=0.15)
+
+
+def test_a_wall_that_two_lidars_see_tilted_against_each_other_has_a_size_of_its_own() -> None:
+    _, repeated = fitted(LIDARS, odd_rad=0.01)
+    assert repeated[0] > 3e-3
+    assert np.median(repeated[1:]) == pytest.approx(REPEATED_RAD, rel=0.25)
+
+
+def test_turns_of_whole_scans_are_no_tilts_of_walls() -> None:
+    """A clock that is late turns all walls of a scan alike: it must not pass for their noise."""
+    own, repeated = fitted(LIDARS, turn_rad=6e-3)
+    assert own == pytest.approx(OWN_RAD, rel=0.05)
+    assert np.sqrt(np.mean(repeated**2)) == pytest.approx(REPEATED_RAD, rel=0.15)
+
+
+def test_one_lidar_alone_does_not_tell_what_it_repeats() -> None:
+    own, repeated = fitted(1)
+    assert own == pytest.approx(OWN_RAD, rel=0.05)
+    assert repeated == pytest.approx(USUAL_RAD)
+
+
+def test_robust_weights_count() -> None:
+    sightings, geometry, lidar = seen(LIDARS)
+    moments = sightings.moments.copy()
+    weights = np.ones(sightings.count)
+    weights[::5] = 0.0
+    moments[::5, 0, 1] += 0.05 * moments[::5, 1, 1]
+    moments[::5, 1, 0] = moments[::5, 0, 1]
+    bent = Sightings(
+        sightings.scan,
+        sightings.strip,
+        moments,
+        sightings.noise,
+        sightings.time_s,
+        sightings.points,
+        (),
+    )
+    offset, walls = np.full(STRIPS, OFFSET_M), np.zeros(STRIPS, np.bool_)
+    before = np.full(STRIPS, 1e-3), np.full(STRIPS, 4e-4)
+    own, _ = fitted_tilts(bent, geometry, lidar, weights, walls, offset, before)
+    assert own == pytest.approx(OWN_RAD, rel=0.05)

@@ -11,7 +11,7 @@ change linearly between some elevations.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,8 +30,8 @@ tilted by what these differ, in every scan alike."""
 CHANNEL_KINDS = 3
 """Of one channel: the first three."""
 
-RANGE = 0
-"""Which of them is the range."""
+RANGE, AZIMUTH = 0, 2
+"""Which of them is the range, and which the azimuth."""
 
 NODES = 16
 """Elevations at most between which the errors of a LiDAR change linearly."""
@@ -129,14 +129,32 @@ class SeenBeams:
     Attributes:
         column: (Q, C) among the errors of the beams of all LiDARs; any where `by` is zero.
         by: (Q, C, 4) linear in h = (p, 1), by an error of 1.
+        turning: (Q, C) share of the points whose azimuth each is an error of; they sum to 1.
     """
 
     column: IntArray
     by: Array
+    turning: Array
 
     def only(self, keep: IntArray | BoolArray) -> SeenBeams:
         """Those of some sightings."""
-        return SeenBeams(self.column[keep], self.by[keep])
+        return SeenBeams(self.column[keep], self.by[keep], self.turning[keep])
+
+    def turned(self, by_turn: Array) -> SeenBeams:
+        """The same, errors of all azimuths together being a turn of the LiDAR the other way.
+
+        That is what they are, and nothing tells one from the other. By the middles of channels
+        they are that but for the noise of the points, a mean over a patch, and dents of the ground
+        (`residuals.smooth_normals`): some thousandths, where a thousand sightings tell the yaw a
+        thousand times better than the errors' priors do.
+
+        Args:
+            by_turn: (Q, 4) derivative of the residuals by a turn of the LiDAR about its z axis.
+        """
+        own = self.turning > 0.0
+        missing = -by_turn - np.einsum("qc,qci->qi", own, self.by)
+        by = self.by + self.turning[:, :, None] * missing[:, None]
+        return replace(self, by=by)
 
 
 def beam_nodes(patches: DrivePatches) -> tuple[BeamNodes, ...]:
@@ -308,9 +326,13 @@ def seen_beams(
     of_sighting = np.repeat(of_sighting, kinds[lidar])
     place = np.arange(len(of_sighting)) - np.searchsorted(of_sighting, of_sighting)
     shape = (len(moments), int(place.max(initial=-1)) + 1)
-    out = SeenBeams(np.zeros(shape, dtype=np.int64), np.zeros((*shape, 4)))
+    out = SeenBeams(np.zeros(shape, dtype=np.int64), np.zeros((*shape, 4)), np.zeros(shape))
     out.column[of_sighting, place] = column[used]
     out.by[of_sighting, place] = by[used]
+    points = np.zeros(by.shape[:2])
+    points[:, AZIMUTH] = np.add.reduceat(part * groups.sums[own, 3], starts)
+    out.turning[of_sighting, place] = points[used]
+    out.turning[:] /= np.maximum(out.turning.sum(axis=1, keepdims=True), 1e-9)
     return out
 
 

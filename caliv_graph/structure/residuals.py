@@ -12,6 +12,7 @@ import scipy.sparse
 
 from caliv_graph.geometry.se3 import skew, stack, tangent_axes, twist_by_turn
 from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.structure.beams import SeenBeams
 from caliv_graph.structure.bends import BENDS
 from caliv_graph.structure.layout import BIASES, Layout, State
 from caliv_graph.structure.sightings import Sightings
@@ -38,6 +39,7 @@ class Geometry:
         by: (Q, C, 4) its derivatives.
         columns: (Q, C) coordinates of these.
         normals_lidar: (Q, 3) normals of the strips in the lidar frame at the scan's stamp.
+        beams: what of `by` is by errors of the beams; None: they have none.
     """
 
     plain: Array
@@ -45,6 +47,7 @@ class Geometry:
     by: Array
     columns: IntArray
     normals_lidar: Array
+    beams: SeenBeams | None = None
 
     def offsets_m(self, sightings: Sightings) -> Array:
         """(Q,) distance of the middle of each sighting from its plane."""
@@ -245,6 +248,7 @@ def geometry_of(
         moved.append((by_turn_rate, own, state.errors[own]))
     beams = sightings.beams
     if beams is not None:
+        beams = beams.turned(by_extrinsic[:, 2])
         own = layout.beam + beams.column
         of_beams += np.einsum("qc,qci->qi", state.errors[own], beams.by)
         parts.append(beams.by)
@@ -258,7 +262,7 @@ def geometry_of(
         parts.append(by)
         columns.append(own)
     by, column = np.concatenate(parts, axis=1), np.concatenate(columns, axis=1)
-    return Geometry(plain + of_beams, plain, by, column, m)
+    return Geometry(plain + of_beams, plain, by, column, m, beams)
 
 
 def _by_compensation(time_s: Array, twists_lidar: Array, by_extrinsic: Array) -> Array:

@@ -106,10 +106,13 @@ def whitened(
     of_plane = np.einsum("qij,qj->qi", noise, geometry.placed)
     pull = np.einsum("qci,qi->qc", geometry.by, of_plane)
     of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=layout.size)
-    beams = sightings.beams
+    beams = geometry.beams
     if beams is not None:
         less = -FITTED / sightings.points[:, None]
         own = less * np.einsum("qci,qi->qc", beams.by, of_plane)
+        # All azimuths together are a turn of the LiDAR, noise included.
+        turning = (own * (beams.turning > 0.0)).sum(axis=1, keepdims=True)
+        own -= beams.turning * turning
         of_noise += np.bincount(
             (layout.beam + beams.column).ravel(), own.ravel(), minlength=layout.size
         )

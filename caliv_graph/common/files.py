@@ -88,6 +88,9 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
                         _flush_to_disk(opened)
             with _uninterrupted():
                 _swap(fresh, target, old)
+        except OutputError as e:
+            # A file in it is named where it will be: nobody finds it in the scratch folder.
+            raise OutputError(str(e).replace(str(fresh), str(path))) from None
         finally:
             with _uninterrupted():
                 shutil.rmtree(scratch, ignore_errors=True)

@@ -272,6 +272,27 @@ def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert names(tmp_path) == []
 
 
+def test_a_file_of_a_folder_is_named_where_it_will_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def write(path: Path) -> None:
+        with output_folder(path, CONTENT) as folder:
+            atomic_write(folder / "calibration.yaml", "text")
+
+    monkeypatch.setattr(os, "fsync", full)
+
+    with pytest.raises(OutputError) as caught:
+        write(tmp_path / "result")
+
+    assert str(caught.value) == (
+        f"{tmp_path}/result/calibration.yaml: cannot be written: No space left on device. Nothing "
+        "was changed; give another --out"
+    )
+
+
 def test_a_place_that_takes_no_files_is_said_before_the_work() -> None:
     # Nobody, not even root, can make a folder there.
     with pytest.raises(OutputError, match=r"^/proc/nowhere/result: cannot be written"):

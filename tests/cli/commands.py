@@ -53,9 +53,7 @@ def start(*arguments: object, pipeline: str = "", cwd: Path = ROOT) -> subproces
         pipeline: source of `calibrate(recordings, config, progress, prior)`; empty: the real one.
         cwd: the folder to run it in.
     """
-    program = ["-m", "caliv_graph"]
-    if pipeline:
-        program = ["-c", _WITH_PIPELINE.format(root=str(ROOT), pipeline=_MADE_UP + pipeline)]
+    program = ["-c", program_with(pipeline)] if pipeline else ["-m", "caliv_graph"]
     return subprocess.Popen(
         [sys.executable, *program, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -66,6 +64,11 @@ def start(*arguments: object, pipeline: str = "", cwd: Path = ROOT) -> subproces
         env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)}
         | {name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")},
     )
+
+
+def program_with(pipeline: str) -> str:
+    """Source of a program that has a pipeline that is made up; see `start`."""
+    return _WITH_PIPELINE.format(root=str(ROOT), pipeline=_MADE_UP + pipeline)
 
 
 def run(

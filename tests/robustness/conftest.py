@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.robustness.hostile_drives import command, simulate, write_config
+from tests.robustness.hostile_drives import simulate
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
@@ -27,16 +27,3 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small drive: never to be written to."""
     return made_once(tmp_path_factory, "drive", simulate)
-
-
-@pytest.fixture(scope="session")
-def result(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A calibration of the small drive: never to be written to."""
-
-    def calibrate(out: Path) -> None:
-        # Structure is not the subject of those who read it: a third of the time.
-        alone = write_config(drive, out.with_suffix(".yaml"), structure={"use": False})
-        done = command("calibrate", alone, "--out", out)
-        assert done.code == 0, done.err
-
-    return made_once(tmp_path_factory, "result", calibrate)

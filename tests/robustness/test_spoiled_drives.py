@@ -85,10 +85,6 @@ def test_a_spoiled_recording(name: str, drive: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("sections", "said"),
     [
-        (
-            {"lidars__front__initial__rpy_deg": [0.0, 0.17, 3.14], **ALONE},
-            "no LiDAR sees the target",
-        ),
         ({"imu": {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [90, 0, 0]}}}, "gravity is along"),
         ({"lidars__front__initial__xyz": [1e300, 0.0, 0.0]}, "xyz.0': must be within +-1e+12"),
         ({"lidars__front__initial__xyz": [2000.0, 0.0, 2000.0]}, "in metres, not millimetres"),
@@ -118,9 +114,6 @@ def test_a_config_that_does_not_fit(
 
     done = command("calibrate", config, "--out", tmp_path / "out")
 
-    if done.code != 2 and sections.keys() & {"lidars__front__initial__rpy_deg"}:
-        check_sound(done, tmp_path / "out", drive / "truth.yaml")
-        return
     assert done.code == 2, done.err
     assert said in done.err
     check_sound(done, tmp_path / "out", drive / "truth.yaml")
@@ -165,6 +158,7 @@ def test_a_guess_with_its_yaw_half_a_turn_off(drive: Path, tmp_path: Path) -> No
         {"lidars__front__sigma": {"xyz": 1e12, "rpy_deg": 1e12}},
         {"lidars__front__sigma": {"xyz": 1e-6, "rpy_deg": 1e-6}},
         {"lidars__front__initial__rpy_deg": [0.0, -10.0, 0.0]},
+        {"lidars__front__initial__rpy_deg": [0.0, 0.17, 3.14]},
         {"lidars__front__initial__xyz": [-2.0, 0.0, -2.0]},
     ],
     ids=str,

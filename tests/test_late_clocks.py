@@ -44,7 +44,7 @@ def quick_config(drive: KeptDrive, has_bag: bool) -> Config:
     """Few components and scans, no structure."""
     raw = config_of(drive, has_bag)
     raw["registration"] = {"components": 150, "max_points": 120}
-    raw["extraction"] = {"max_scans": 24}
+    raw["extraction"] = {"max_scans": 16}
     return without_structure(parse_config(raw, "config.yaml", Path("/nowhere")))
 
 

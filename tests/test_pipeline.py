@@ -132,12 +132,6 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> list[Tried]:
 
 
 @pytest.fixture(scope="module")
-def coarse(quiet: list[Tried]) -> Tried:
-    """The first of these drives, registered more coarsely."""
-    return try_out(quiet[0].drive.asked(registration=QUICK))
-
-
-@pytest.fixture(scope="module")
 def sparse(tmp_path_factory: pytest.TempPathFactory) -> Tried:
     """Half of the clouds, registered coarsely: for runs that must end alike, however well."""
     scenario = paper_scenario(rate_hz=1.25)
@@ -516,16 +510,16 @@ def test_an_unsteady_end_is_the_mean_of_several(
 
 
 @pytest.mark.parametrize("kernel", ["huber", "tls", "trimmed"])
-def test_displaced_clouds_lose_their_say(coarse: Tried, kernel: RobustKernel) -> None:
+def test_displaced_clouds_lose_their_say(sparse: Tried, kernel: RobustKernel) -> None:
     # A tenth of the clouds that see the chair, each 0.3 m off to some side.
-    clean = coarse
+    clean = sparse
     rng = np.random.default_rng(3)
     seen = sorted((c.lidar, c.stamp_ns) for o in clean.run.observations for c in o.clouds)
     bad = {
         seen[i]: 0.3 * np.array([math.cos(angle), math.sin(angle), 0.0])
         for i, angle in zip(
-            rng.permutation(len(seen))[: len(seen) // 10],
-            rng.uniform(0.0, 2.0 * math.pi, len(seen) // 10),
+            rng.permutation(len(seen))[:2],
+            rng.uniform(0.0, 2.0 * math.pi, 2),
             strict=True,
         )
     }
@@ -540,7 +534,7 @@ def test_displaced_clouds_lose_their_say(coarse: Tried, kernel: RobustKernel) ->
     clouds = [c for o in tried.run.observations for c in o.clouds]
     weights = np.concatenate(tried.run.solution.cloud_weights)
     is_bad = np.array([(c.lidar, c.stamp_ns) in bad for c in clouds])
-    assert is_bad.sum() == len(bad) == 3
+    assert is_bad.sum() == len(bad) == 2
     assert weights[is_bad].max() < 0.5, np.round(weights[is_bad], 2).tolist()
     assert np.median(weights[~is_bad]) > 0.9
     # What is left gives the same as without them, but for what these clouds themselves had told.

@@ -61,7 +61,8 @@ def test_no_smaller_candidate_is_good_enough() -> None:
     assert found.met
     smaller = [s for _, s in candidates(scenario()) if area(s) < 0.99 * area(found.scenario)]
     assert smaller
-    for other in smaller[::3]:
+    # The largest first: those that are nearly good enough are among them.
+    for other in sorted(smaller, key=area)[::-8]:
         with contextlib.suppress(TargetError):
             assert not is_met(shortfall(predict(other), goals), goals)
 

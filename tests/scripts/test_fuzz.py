@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("atheris", reason="has no package for this platform")
 
 ROOT = Path(__file__).resolve().parents[2]
-RUNS = 700
+RUNS = 400
 SCRIPT = ROOT / "scripts" / "fuzz.py"
 
 
@@ -35,7 +35,7 @@ FUZZ = load()
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     out = tmp_path_factory.mktemp("fuzz")
     done = subprocess.run(
-        [sys.executable, SCRIPT, "--runs", str(RUNS), "--seed", "7", "--json", "--out", out],
+        [sys.executable, SCRIPT, "--runs", str(RUNS), "--seed", "3", "--json", "--out", out],
         stdout=subprocess.PIPE,
         text=True,
         timeout=300,

@@ -37,3 +37,21 @@ def test_a_worker_that_dies_before_its_nanny_knows_it_is_replaced(
 
         assert len(pids - {pid}) == 1
         assert workers.count() == 1
+
+
+def test_a_scheduler_without_certificates_is_connected() -> None:
+    from distributed import LocalCluster
+
+    with LocalCluster(  # type: ignore[no-untyped-call]
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp",
+        host="127.0.0.1",
+        dashboard_address=None,
+    ) as there:
+        assert there.scheduler_address.startswith("tcp://")
+        with cluster.connect(there.scheduler_address) as workers:
+            assert workers.connected
+            assert workers.count() == 1
+            assert workers.client.submit(os.getpid, pure=False).result() == os.getpid()

@@ -257,6 +257,9 @@ def test_interrupted_killed_and_resumed_it_ends_the_same(
     fleet: Path, finished: tuple[Path, subprocess.CompletedProcess[str]]
 ) -> None:
     out = fleet / "broken"
+    # One of its two jobs has been done before.
+    shutil.copytree(finished[0], out)
+    shutil.rmtree(out / "tue")
     arguments = (fleet / "good.yaml", "--out", out, "--workers", 1)
 
     process = launch(*arguments)
@@ -309,8 +312,6 @@ def test_a_job_that_kills_its_worker_twice_has_failed(fleet: Path) -> None:
 def certified(folder: Path) -> dict[str, str]:
     """The settings of Dask for a certificate that signs itself, as environment variables."""
     key, certificate = folder / "key.pem", folder / "certificate.pem"
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl, which makes certificates, is not installed")
     made = ("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
     subject = ("-days", "1", "-subj", "/CN=127.0.0.1", "-keyout", key, "-out", certificate)
     subprocess.run(["openssl", *made, *subject], check=True, capture_output=True)
@@ -320,19 +321,21 @@ def certified(folder: Path) -> dict[str, str]:
     return {f"DASK_DISTRIBUTED__COMM__TLS__{name}": str(path) for name, path in files.items()}
 
 
-@pytest.fixture(params=["tcp", "tls"])
-def scheduler(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[str]:
-    """A Dask scheduler and a worker, as an administrator would start them."""
+@pytest.fixture
+def scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A Dask scheduler and a worker, as an administrator would start them.
+
+    With certificates, where there is openssl, which makes them.
+    """
+    protocol = "tls" if shutil.which("openssl") else "tcp"
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        address = f"{request.param}://127.0.0.1:{free.getsockname()[1]}"
-    if request.param == "tls":
+        address = f"{protocol}://127.0.0.1:{free.getsockname()[1]}"
+    if protocol == "tls":
         for name, value in certified(tmp_path).items():
             monkeypatch.setenv(name, value)
     dask = (sys.executable, "-m", "dask")
-    local = ("--no-dashboard", "--host", "127.0.0.1", "--protocol", request.param)
+    local = ("--no-dashboard", "--host", "127.0.0.1", "--protocol", protocol)
     # Without the process beside the worker that would start it again.
     worker = (*dask, "worker", address, *local, "--nthreads", "1", "--no-nanny")
     commands = [
@@ -354,7 +357,7 @@ def scheduler(
 def test_on_an_existing_scheduler(
     fleet: Path, finished: tuple[Path, subprocess.CompletedProcess[str]], scheduler: str
 ) -> None:
-    out = fleet / f"elsewhere-{scheduler[:3]}"
+    out = fleet / "elsewhere"
     manifest = write_manifest(fleet / "one.yaml", {"name": "tue", "config": "tue/config.yaml"})
 
     result = batch(manifest, "--out", out, "--scheduler", scheduler)

@@ -294,6 +294,7 @@ def staged(sparse: Tried) -> Tried:
 
 def test_staged_is_as_good_as_the_paper_between_sensors(staged: Tried) -> None:
     assert staged.run.solution.mode == "staged"
+    assert staged.run.calibration.contradictions == ()
     # The figures of the paper's procedure and its authors' code, the larger of both.
     limits = np.array([4.9 * MRAD, 7.7 * MRAD, 1.5 * MRAD, 20 * MM, 20 * MM, 26 * MM])
     assert (np.abs(staged.s2s()) < limits).all(), rounded(staged.s2s())
@@ -509,7 +510,7 @@ def test_an_unsteady_end_is_the_mean_of_several(
 # ------------------------------------------------------------------ outliers
 
 
-@pytest.mark.parametrize("kernel", ["huber", "tls", "trimmed"])
+@pytest.mark.parametrize("kernel", ["huber", "tls"])
 def test_displaced_clouds_lose_their_say(sparse: Tried, kernel: RobustKernel) -> None:
     # A tenth of the clouds that see the chair, each 0.3 m off to some side.
     clean = sparse
@@ -527,9 +528,7 @@ def test_displaced_clouds_lose_their_say(sparse: Tried, kernel: RobustKernel) ->
     def displaced(scan: LidarScan) -> Array:
         return scan.points_lidar + bad.get((scan.lidar, scan.stamp_ns), np.zeros(3))
 
-    # A tenth of what `trimmed` is told to drop is no more than there is: it is told of some more.
-    robust = RobustConfig(kernel=kernel, trim_percent=12.0)
-    tried = try_out(clean.drive.with_points(displaced).asked(robust=robust))
+    tried = try_out(clean.drive.with_points(displaced).asked(robust=RobustConfig(kernel=kernel)))
 
     clouds = [c for o in tried.run.observations for c in o.clouds]
     weights = np.concatenate(tried.run.solution.cloud_weights)

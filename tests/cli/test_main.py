@@ -202,7 +202,7 @@ def test_bad_input_is_one_line_and_no_output(config: Path, form: list[str]) -> N
 
 
 def test_a_defect_of_the_program(config: Path) -> None:
-    result = run("calibrate", config, "--out", config.parent / "out", pipeline=BREAKS)
+    result = called("calibrate", config, "--out", config.parent / "out", pipeline=BREAKS)
 
     assert result.returncode == 1
     lines = result.stderr.splitlines()
@@ -212,8 +212,9 @@ def test_a_defect_of_the_program(config: Path) -> None:
     assert not (config.parent / "out").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("pipeline", [WAITS, LOSES_THE_INTERRUPT])
+@pytest.mark.parametrize(
+    ("pipeline", "number"), [(WAITS, signal.SIGTERM), (LOSES_THE_INTERRUPT, signal.SIGINT)]
+)
 def test_an_interrupt_leaves_nothing(config: Path, number: int, pipeline: str) -> None:
     before = sorted(config.parent.iterdir())
     process = start("calibrate", config, "--out", config.parent / "out", pipeline=pipeline)

@@ -46,8 +46,11 @@ from tests.drives_with_chair import QUICK, paper_scenario, simulated, without_st
 
 ROOT = Path(__file__).resolve().parents[2]
 
-EVIL = '<script>alert("x")</script> & <b>up</b>'
+EVIL = '<script>alert("x")</script> & <b>up</b></script><img src=x onerror=alert(1)>'
 """What somebody may call a LiDAR."""
+
+EVIL_FOLDER = "<_script><img src=x onerror=alert(1)>"
+"""What somebody may call a drive."""
 
 MOST_BYTES = 10_000_000
 
@@ -86,7 +89,7 @@ class Ran:
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """An arc from raw sensors, and a LiDAR with a bad name that never sees the target."""
-    folder = tmp_path_factory.mktemp("bag") / "arc"
+    folder = tmp_path_factory.mktemp("bag") / EVIL_FOLDER
     scenario = load_scenario(ROOT / "configs/scenarios/demo_arc.yaml")
     slow = {n: m.model_copy(update={"rate_hz": 1.25}) for n, m in scenario.lidars.items()}
     write_drive(scenario.model_copy(update={"lidars": slow}), folder, 1, threads=1)
@@ -99,7 +102,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Ran:
 @pytest.fixture(scope="module")
 def staged(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """Given poses, no ground, and the paper's two stages."""
-    scenario = paper_scenario(rate_hz=2.0, position_sigma_m=0.005, rotation_sigma_rad=1e-3)
+    scenario = paper_scenario(rate_hz=1.25, position_sigma_m=0.005, rotation_sigma_rad=1e-3)
     drive = simulated(scenario, 1, tmp_path_factory.mktemp("caliv") / "arc")
     config = drive.config.model_copy(
         update={"solve": SolveConfig(mode="staged"), "registration": QUICK}
@@ -130,10 +133,12 @@ class Page(HTMLParser):
         self.words: list[str] = []
         self.loads: list[str] = []
         self.tags: list[str] = []
+        self.attributes: set[str] = set()
         self.feed(html)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
+        self.attributes |= {key for key, _ in attrs}
         self.loads += [value or "" for key, value in attrs if key in ("src", "href", "srcset")]
         if tag in ("script", "style"):
             self.inside.append(tag)
@@ -313,6 +318,9 @@ def test_names_do_not_run(bag: Ran) -> None:
 
     page = Page(html)
     assert EVIL in page.text
+    assert EVIL_FOLDER in page.text
+    assert "img" not in page.tags
+    assert "onerror" not in page.attributes
     assert "alert(" not in "".join(re.findall(r"<script>(.*?)</script>", html, re.DOTALL)[-1:])
     assert '<script>alert("x")' not in html
     assert "<b>up" not in html

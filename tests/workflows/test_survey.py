@@ -112,8 +112,16 @@ TABLE = {
 GROUNDS: tuple[Ground, ...] = ("none", "plane", "height")
 
 
-@pytest.mark.parametrize("ground", GROUNDS)
-@pytest.mark.parametrize("name", list(TABLE))
+@pytest.mark.parametrize(
+    ("name", "ground"),
+    [
+        (name, ground)
+        for name in TABLE
+        for ground in GROUNDS
+        # Columns of "none" and "plane" are equal: two of the drives show that.
+        if ground != "plane" or name in ("arc", "S-curve")
+    ],
+)
 def test_the_table_on_noisy_drives(name: str, ground: Ground) -> None:
     column = GROUNDS.index(ground)
 

@@ -54,7 +54,7 @@ def test_topics_that_are_swapped() -> None:
     assert "Exchange lidars.front.topic and lidars.rear.topic" in text
 
 
-@pytest.mark.parametrize("degrees", [180.0, 90.0, -90.0])
+@pytest.mark.parametrize("degrees", [180.0, -90.0])
 def test_a_guess_whose_yaw_is_a_quarter_turn_off(degrees: float) -> None:
     config = config_of(front=FRONT.compose(ERROR), rear=turned(degrees, REAR.compose(ERROR)))
     (doubt,) = found(config)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -141,19 +140,19 @@ def test_guesses_are_drawn_as_in_the_paper() -> None:
 
 
 @pytest.mark.parametrize("json", [[], ["--json"]])
-def test_without_the_drive_it_says_so_in_one_line(tmp_path: Path, json: list[str]) -> None:
-    script = ROOT / "scripts/benchmark_released.py"
-    ended = subprocess.run(
-        [sys.executable, script, "--data", tmp_path / "nowhere", *json],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={"PYTHONPATH": str(ROOT)},
-    )
+def test_without_the_drive_it_says_so_in_one_line(
+    tmp_path: Path,
+    json: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["benchmark", "--data", str(tmp_path / "nowhere"), *json])
 
-    assert ended.returncode == 2
-    assert ended.stdout == ""
-    assert ended.stderr == (
+    assert benchmark.main() == 2
+
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err == (
         f"error: {tmp_path}/nowhere: the drive that the CaLiV authors published is not there "
         "(input/ and original_config.yaml). Give --data the folder that holds it\n"
     )

@@ -155,10 +155,9 @@ def test_growth_of_memory_is_per_minute_and_can_exceed_its_limit() -> None:
     assert check_memory.document(lengths, 4.0)["kept"] is False
 
 
-@pytest.mark.parametrize("script", ["benchmark_speed.py", "check_memory.py"])
-def test_scripts_run_from_anywhere(script: str, tmp_path: Path) -> None:
+def test_a_script_runs_from_anywhere(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / script), "--help"],
+        [sys.executable, str(ROOT / "scripts/check_memory.py"), "--help"],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,14 +10,19 @@ import pytest
 from caliv_graph.scenario.model import load_scenario
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-SCRIPT = REPOSITORY / "scripts/benchmark_trajectory.py"
 
 
-def test_help_says_what_is_compared() -> None:
-    done = subprocess.run(
-        [sys.executable, str(SCRIPT), "--help"], capture_output=True, text=True, check=True
-    )
-    assert "UKF" in done.stdout
+def test_help_says_what_is_compared(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from scripts.benchmark_trajectory import main
+
+    monkeypatch.setattr(sys, "argv", ["benchmark", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+
+    assert ended.value.code == 0
+    assert "UKF" in capsys.readouterr().out
 
 
 def test_the_smoother_is_better_than_the_filter_and_both_are_honest() -> None:

@@ -115,14 +115,13 @@ def test_without_the_command_it_says_so_in_one_line(
     )
 
 
-def test_help_names_both_drives() -> None:
-    shown = subprocess.run(
-        [sys.executable, ROOT / "scripts/_demo.py", "--help"],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={"PYTHONPATH": str(ROOT)},
-    ).stdout
+def test_help_names_both_drives(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(monkeypatch, "--help")
 
+    assert ended.value.code == 0
+    shown = capfd.readouterr().out
     assert "--released" in shown
     assert "--out DIR" in shown

@@ -204,22 +204,15 @@ def test_accelerations_are_those_ahead_and_into_the_curve() -> None:
 
 
 def test_roll_and_pitch_do_not_tell_the_height_of_an_antenna() -> None:
-    low, high = (
-        smooth_trajectory(
-            wheels(1),
-            config_for(
-                replace(ANTENNA, lever_arm=(0.3, 0.5, z)), gnss={"lever_arm": [0.3, 0.5, z]}
-            ),
-            stamps(DRIVE.duration_s, 5.0, 0.05),
-        )
-        for z in (1.5, 2.1)
-    )
+    z = ANTENNA.lever_arm[2] + 0.3
+    stated = replace(ANTENNA, lever_arm=(0.3, 0.5, z))
+    config = config_for(stated, gnss={"lever_arm": [0.3, 0.5, z]})
+    found = smooth_trajectory(wheels(1), config, stamps(DRIVE.duration_s, 5.0, 0.05))
     # The sigma of 10 mm stays, and the value.
-    for found, z in ((low, 1.5), (high, 2.1)):
-        sigmas = found.sigmas_of("gnss.lever_arm")
-        assert sigmas is not None
-        assert sigmas[2] == pytest.approx(0.01, rel=1e-3)
-        assert found.data.lever_arm[2] == pytest.approx(z, abs=1e-4)
+    sigmas = found.sigmas_of("gnss.lever_arm")
+    assert sigmas is not None
+    assert sigmas[2] == pytest.approx(0.01, rel=1e-3)
+    assert found.data.lever_arm[2] == pytest.approx(z, abs=1e-4)
 
 
 def test_with_an_imu_scale_and_place_of_the_speed_are_found() -> None:
@@ -262,11 +255,10 @@ def test_forward_speeds_do_not_tell_how_an_imu_is_turned() -> None:
     assert sigmas[1:] == pytest.approx(np.radians([0.3, 0.3]), rel=0.1)
 
 
-@pytest.mark.parametrize("hz", [1, 2])
-def test_receivers_of_one_hertz_tell_the_course_too(hz: int) -> None:
+def test_receivers_of_one_hertz_tell_the_course_too() -> None:
     motion, usual = wheels(1), smoothed(True)[1]
     assert motion.gnss is not None
-    kept = np.arange(len(motion.gnss.stamps_ns)) % (10 // hz) == 0
+    kept = np.arange(len(motion.gnss.stamps_ns)) % 10 == 0
     few = replace(motion, gnss=rows_of(motion.gnss, kept))
     found = smooth_trajectory(few, settings(), stamps(DRIVE.duration_s, 5.0, 0.05))
     nees, turn, _ = whitened(few, found)

@@ -88,7 +88,8 @@ def test_without_noise_it_is_the_truth() -> None:
 
 def test_accuracy_and_covariance_agree_on_the_arc() -> None:
     squares, nees = [], []
-    for seed in range(4):
+    drives = 3
+    for seed in range(drives):
         motion = record(ARC, Sensors(), seed)
         smoothed = smooth_trajectory(motion, config_for(Sensors()), stamps(17.0, 10.0))
         values, turn, shift = whitened(ARC, motion, smoothed)
@@ -99,7 +100,7 @@ def test_accuracy_and_covariance_agree_on_the_arc() -> None:
     # at sqrt(sqrt(q r) / 2) = 0.35 mrad per axis, 0.61 mrad in all; gravity helps a little.
     assert 0.45e-3 < turn_rmse < 0.66e-3
     assert 3e-3 < shift_rmse < 8e-3
-    low, high = float(chi2.ppf(0.025, 6 * 4)) / 4, float(chi2.ppf(0.975, 6 * 4)) / 4
+    low, high = (float(chi2.ppf(p, 6 * drives)) / drives for p in (0.025, 0.975))
     assert low < float(np.mean(nees)) < high
 
 

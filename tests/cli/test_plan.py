@@ -117,11 +117,10 @@ def test_what_is_made_of_the_ground() -> None:
                 "undetermined"
             ]
         ]
-        for ground in ("none", "plane", "height")
+        for ground in ("plane", "height")
     }
 
     assert texts == {
-        "none": ["height of all LiDARs together"],
         "plane": ["height of all LiDARs together"],
         "height": [],
     }

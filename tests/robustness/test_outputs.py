@@ -159,23 +159,21 @@ def test_what_a_kill_leaves_is_not_in_the_way(results: tuple[Path, Path], tmp_pa
     assert sorted(path.name for path in tmp_path.iterdir()) == [left.name, out.name]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_simulation_that_is_interrupted(number: int, tmp_path: Path) -> None:
+def test_a_simulation_that_is_interrupted(tmp_path: Path) -> None:
     scenario = tmp_path / "scenario.yaml"
-    scenario.write_text(yaml.safe_dump(dict(SCENARIO)))
+    # Ten times as long as the small drive: it is not done when the signal comes.
+    long = {**SCENARIO, "drive": {**SCENARIO["drive"], "duration_s": 140.0}}
+    scenario.write_text(yaml.safe_dump(long))
     out = tmp_path / "drives" / "drive"
     out.parent.mkdir()
 
-    done, said = interrupted(number, 1, 0.4, "simulate", scenario, "--out", out, "--format", "both")
+    done, said = interrupted(
+        signal.SIGTERM, 1, 0.4, "simulate", scenario, "--out", out, "--format", "both"
+    )
 
     assert said == ["simulating: started\n"]
-    assert "Traceback" not in done.err
-    if out.exists():
-        assert {"config.yaml", "truth.yaml", "drive"} <= {path.name for path in out.iterdir()}
-    beside = [path.name for path in out.parent.iterdir() if path != out]
-    assert beside == [] if number != signal.SIGKILL else all(n.startswith(".") for n in beside)
-    if number == signal.SIGTERM and not out.exists():
-        assert (done.code, done.err) == (130, "error: interrupted\n")
+    assert (done.code, done.err) == (130, "error: interrupted\n")
+    assert list(out.parent.iterdir()) == []
 
 
 _AT_THE_LAST_STEP = """

@@ -22,7 +22,10 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = here / "out/walkthrough"
     write_drive(scenario_of("arc"), folder, 1, output="bag", threads=1)
     document = yaml.safe_load((folder / "config.yaml").read_text())
-    document |= {"solve": {"mode": "staged"}, "registration": {"max_points": 250}}
+    document |= {
+        "solve": {"mode": "staged"},
+        "registration": {"components": 300, "max_points": 250},
+    }
     document |= {"ground": {"use": False}}
     (folder / "my_config.yaml").write_text(yaml.safe_dump(document))
     found: dict[str, Any] = {}

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caliv_graph.common.sorting import stable_order
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray
@@ -152,7 +153,7 @@ def near_points(points: Array, up: Array) -> IntArray:
         index = index[rng.random(len(index)) < MAX_POINTS / len(index)]
     index = index[rng.permutation(len(index))]
     cell = _cells(points[index] @ tangent_axes(up).T, CELL_M)
-    order = np.argsort(cell, kind="stable")
+    order = stable_order(cell)
     sorted_cell = cell[order]
     first = np.flatnonzero(np.diff(sorted_cell, prepend=-1))
     rank = np.arange(len(order)) - np.repeat(first, np.diff(np.append(first, len(order))))

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from caliv_graph.common.sorting import stable_order
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.channels import ChannelSums, PointChannels
 from caliv_graph.structure.patches import Swept
@@ -263,7 +264,7 @@ def _grouped(cells: _Cells, some: IntArray, undone: tuple[int, int], slot: IntAr
     key = (slot[some] * 6 + cells.face[some]) * (FINEST + 1) + level
     for place, back in zip((cells.across, cells.along), undone, strict=True):
         key = key * width + (place[some] >> (FINEST - np.maximum(level - back, 0)))
-    order = np.argsort(key, kind="stable")
+    order = stable_order(key)
     key = key[order]
     starts = np.ones(len(key), dtype=bool)
     starts[1:] = key[1:] != key[:-1]

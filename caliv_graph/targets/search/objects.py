@@ -39,6 +39,9 @@ MAX_LINK_M = 1.0
 LINK_BEAMS = 2.5
 """Points are linked up to this many beam spacings: across one beam that hit something else."""
 
+LINKS_PER_POINT = 4
+"""Links per point that connected components are looked for with at first."""
+
 VERTICAL = 0.4
 """Factor on distances along z: rings of a LiDAR are farther apart than its columns."""
 
@@ -208,7 +211,24 @@ def _clusters(stands: _Standing, spacing: Array) -> IntArray:
 
 
 def connected(pairs: IntArray, count: int) -> IntArray:
-    """Labels (count,) of the connected components of points, given linked pairs (p, 2) of them."""
+    """Labels (count,) of the connected components of points, given linked pairs (p, 2) of them.
+
+    They are numbered in the order of their first points.
+    """
+    # A dense object has hundreds of links per point. A few per point join nearly all of it, and
+    # only those that join more count then.
+    every = max(len(pairs) // (LINKS_PER_POINT * max(count, 1)), 1)
+    labels = _components(pairs[::every], count)
+    if every > 1:
+        first, second = (labels.take(pairs[:, end]) for end in (0, 1))
+        apart = np.flatnonzero(first != second)
+        ends = np.column_stack([first.take(apart), second.take(apart)])
+        labels = _components(ends, int(labels.max()) + 1).take(labels)
+    return labels
+
+
+def _components(pairs: IntArray, count: int) -> IntArray:
+    """`connected`, of pairs that are all looked at."""
     links = np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])
     graph = coo_array(links, shape=(count, count))
     _, labels = connected_components(graph, directed=False)

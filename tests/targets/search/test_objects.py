@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array
-from caliv_graph.targets.search.objects import ScanObject, ScanObjects, segment_scan
+from caliv_graph.targets.search.objects import ScanObject, ScanObjects, connected, segment_scan
 
 HEIGHT_M = 2.0
 """Of the LiDAR above the ground."""
@@ -157,3 +157,23 @@ class TestMoreThanOne:
         found = only(seen([box_at(21.4, 21.4, 1.4, 2.0)], directions(step_deg=0.1)))
         assert found.hidden
         assert not only(seen([box_at(18.4, 18.4, 1.4, 2.0)], directions(step_deg=0.1))).hidden
+
+
+@pytest.mark.parametrize("reach", [0.05, 0.2, 0.6])
+def test_what_is_connected_does_not_depend_on_how_many_links_say_so(reach: float) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.random((400, 2)) + 3.0 * rng.integers(0, 2, (400, 1))
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    pairs = np.argwhere(np.triu(apart < reach, 1))
+    labels = connected(pairs, len(points))
+    reached = apart < reach
+    for _ in range(9):  # each doubles the number of steps
+        reached = (reached.astype(np.float32) @ reached.astype(np.float32)) > 0.0
+    assert np.array_equal(labels[:, None] == labels[None], reached)
+    first = np.unique(labels, return_index=True)[1]
+    assert (np.diff(first) > 0).all()  # numbered by their first points
+
+
+def test_points_without_links_are_alone() -> None:
+    assert connected(np.zeros((0, 2), np.int64), 3).tolist() == [0, 1, 2]
+    assert connected(np.zeros((0, 2), np.int64), 0).tolist() == []

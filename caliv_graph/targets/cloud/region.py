@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from caliv_graph.common.sorting import first_of_cells
 from caliv_graph.config.model import Config, ExtractionConfig, TargetRegion
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, IntArray, LidarScan, TargetCloud
@@ -143,8 +144,7 @@ def _filtered(points: Array, places: Array, extraction: ExtractionConfig) -> Int
     """
     keep = np.arange(len(points))
     if extraction.voxel > 0.0:
-        cells = np.floor(points / extraction.voxel).astype(np.int64)
-        keep = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+        keep = first_of_cells(np.floor(points / extraction.voxel).astype(np.int64))
     k = extraction.outlier_neighbours
     if k and len(keep) > k + 1:
         distances, _ = cKDTree(places[keep]).query(places[keep], k + 1)
@@ -213,8 +213,12 @@ class RegionExtractor:
         margin = widened_margin_m(self._config, scan.lidar, range_m)
         if self._config.lidars[scan.lidar].fixed:
             margin += self._swept_m(scan)
-        offset = scan.points_lidar - R.T @ (self.centre - t)
-        distance2 = np.einsum("ni,ni->n", offset, offset)  # to the middle of the region
+        middle = R.T @ (self.centre - t)
+        distance2 = np.zeros(len(scan.points_lidar))  # to the middle of the region
+        for side, of_middle in zip(scan.points_lidar.T.copy(), middle, strict=True):
+            side -= of_middle
+            side *= side
+            distance2 += side
 
         def near_region(margin: float) -> tuple[Array, IntArray]:
             return self._near_region(scan.points_lidar, distance2, R, t, margin, tally)
@@ -329,12 +333,12 @@ class RegionExtractor:
         near = np.flatnonzero(distance2 < radius**2)
         if len(near) == 0:
             near = np.array([distance2.argmin()])
-        points = points_lidar[near] @ R.T + t
+        points = points_lidar.take(near, axis=0) @ R.T + t
         outside = np.maximum(np.maximum(self._low - points, points - self._high), 0.0)
         distance = np.sqrt(np.einsum("ni,ni->n", outside, outside))
         tally.nearest_m = min(tally.nearest_m, float(distance.min()))
         inside = distance <= margin
-        return points[inside], near[inside]
+        return points.compress(inside, axis=0), near.compress(inside)
 
     def _objects(
         self, points: Array, groups: Sequence[IntArray], cut_off: Sequence[bool]

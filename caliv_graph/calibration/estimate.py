@@ -56,6 +56,7 @@ from caliv_graph.calibration.structure_evidence import (
     rough_extrinsics,
     solved_with_structure,
 )
+from caliv_graph.common.memory import keeping_larger_arrays
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import unstack
@@ -145,7 +146,8 @@ def _estimate(
     problem = pose_problem(observations, trajectories, config, kept_ns=kept)
     guesses = {name: problem.guesses[name] for name in problem.lidars}
     guessed = _held_grounds(grounds, guesses, problem)
-    rough = rough_solve(problem, observations, guessed, config, progress, limit)
+    with keeping_larger_arrays():
+        rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
         extrinsics = problem.extrinsics(rough.state.values)
         start = rough_extrinsics(rough.state)
@@ -172,7 +174,10 @@ def _estimate(
         for m, o in enumerate(observations)
     ]
     registrations = []
-    with progress.stage("registering again, from the solved graph", len(states)) as advance:
+    with (
+        progress.stage("registering again, from the solved graph", len(states)) as advance,
+        keeping_larger_arrays(),
+    ):
         for state, (R, t) in zip(states, per_placement(problem, lines), strict=True):
             state.refine_normals(R, t)
             registrations.append(register_jointly(state, unstack(R, t), limit, coarse=False))
@@ -206,7 +211,10 @@ def _estimate(
     times["graph"] = rough.graph_s
     most = refinements(config.noise.lidar_range_m)
     total = most + OTHER_STARTS * further_refinements(config.noise.lidar_range_m)
-    with progress.stage("refining shape and graph together", total) as advance:
+    with (
+        progress.stage("refining shape and graph together", total) as advance,
+        keeping_larger_arrays(),
+    ):
         if config.solve.mode == "staged":
             registrations, course = registered_with_motion(solve, states, most, advance)
         else:

@@ -39,6 +39,38 @@ def test_arrays_are_made_of_memory_that_was_freed() -> None:
     assert kept < 0.05 * usual
 
 
+LARGER = """
+import resource
+import numpy as np
+from caliv_graph.common.memory import keep_freed_memory, keeping_larger_arrays
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        some = np.ones(2 * 10**6)  # 16 MB
+        del some
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+with keeping_larger_arrays():  # of a process that did not ask for it: nothing happens
+    pass
+if keep_freed_memory():
+    usual = faults()
+    with keeping_larger_arrays():
+        faults()
+        print(usual, faults())
+"""
+
+
+def test_larger_arrays_are_kept_for_a_while() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LARGER], capture_output=True, text=True, check=True
+    )
+    if not done.stdout:
+        pytest.skip("the system's library is not glibc")
+    usual, kept = map(int, done.stdout.split())
+    assert kept < 0.05 * usual
+
+
 PASSED_OVER = """
 import gc
 import weakref

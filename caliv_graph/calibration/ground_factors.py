@@ -61,9 +61,10 @@ def _chain(
 
     Only the poses after it matter: no number here grows with the distance from the map's origin.
     """
-    after = gtsam.Pose3()
-    moves: list[Array] = []
-    for key in reversed(keys):
+    *first, last = keys
+    after = values.atPose3(last)
+    moves = [np.eye(6)]
+    for key in reversed(first):
         if derivatives:
             moves.append(np.asarray(after.inverse().AdjointMap()))
         after = values.atPose3(key).compose(after)
@@ -152,28 +153,38 @@ def ground_plane_factor(
     if key_rates is not None and observation.by_rates is not None:
         nuisances[key_rates] = -observation.by_rates @ by_rates(_turning(observation))
     moving = _Moving.of(observation) if key_rates in nuisances else None
+    free = observation.R_vehicle_lidar is not None and observation.by_extrinsic is not None
+    usual = np.array([0.0, 0.0, observation.distance_m])
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         T, moves = _chain(values, poses, jacobians is not None)
         g = values.atVector(key_plane)
         d, by_plane, n = height_over(g, centre, T.translation())
-        R_lidar_map = T.rotation().matrix().T
+        rotation = T.rotation()
+        R_lidar_map = rotation.matrix().T
         n_lidar = R_lidar_map @ n
-        R_map_vehicle = values.atPose3(poses[0]).rotation()
-        R_vehicle_lidar = R_map_vehicle.between(T.rotation()).matrix()
-        said = compensated(observation, R_vehicle_lidar)
-        twist = None if moving is None else moving.at(R_map_vehicle.matrix())
+        said = usual
+        if free:
+            R_vehicle_lidar = values.atPose3(poses[0]).rotation().between(rotation).matrix()
+            said = compensated(observation, R_vehicle_lidar)
+        twist = None
+        if moving is not None:
+            twist = moving.at(values.atPose3(poses[0]).rotation().matrix())
         if moving is not None and twist is not None:
-            said += moving.by_rates @ twist - moving.usual
+            said = said + moving.by_rates @ twist - moving.usual
         if jacobians is not None:
+            x, y, z = n_lidar.tolist()
             J = np.zeros((3, 6))
-            J[:2, :3] = axes @ skew(n_lidar)
+            J[:2, :3] = axes @ np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
             J[2, 3:] = n_lidar
             jacobians[0] = J @ moves[0]
-            J[:, :3] -= compensated_by_turn(observation, R_vehicle_lidar)
+            if free:
+                J[:, :3] -= compensated_by_turn(observation, R_vehicle_lidar)
             for i, move in enumerate(moves[1:], start=1):
                 jacobians[i] = J @ move
-            jacobians[len(moves)] = np.vstack([axes @ R_lidar_map @ normal_jacobian(g), by_plane])
+            by_g = np.empty((3, 3))
+            by_g[:2], by_g[2] = axes @ R_lidar_map @ normal_jacobian(g), by_plane
+            jacobians[len(moves)] = by_g
             for i, by_one in enumerate(nuisances.values(), start=len(moves) + 1):
                 jacobians[i] = by_one
             if moving is not None and twist is not None:

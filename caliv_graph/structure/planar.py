@@ -206,8 +206,10 @@ def _even_part(points: Array, times_s: Array | None) -> tuple[Array, Array | Non
     """At most `MAX_POINTS` points, the same of the same cloud."""
     if len(points) <= MAX_POINTS:
         return points, times_s
-    keep = np.modf(np.arange(len(points)) * GOLDEN)[0] < MAX_POINTS / len(points)
-    return points[keep], None if times_s is None else times_s[keep]
+    turns = np.arange(len(points)) * GOLDEN
+    keep = turns - np.floor(turns) < MAX_POINTS / len(points)
+    # Indexing with a mask takes four times as long.
+    return points.compress(keep, axis=0), None if times_s is None else times_s.compress(keep)
 
 
 @dataclass(frozen=True)
@@ -225,15 +227,16 @@ class _Cells:
 
 def _cells(points: Array) -> _Cells:
     """The cells of points (N, 3)."""
-    size = np.abs(points)
-    axis = np.argmax(size, axis=1)
-    rows = np.arange(len(points))
-    height = points[rows, axis]
-    face = 2 * axis + (height < 0.0)
+    x, y, z = points.T.copy()  # numpy is fast along a row
+    is_y = np.abs(y) > np.abs(x)
+    wider = np.where(is_y, y, x)
+    is_z = np.abs(z) > np.abs(wider)
+    height = np.where(is_z, z, wider)
+    face = 2 * np.where(is_z, 2, is_y) + (height < 0.0)
     width = ROOT_CELLS << FINEST
     # x: y and z; y: x and z; z: x and y.
-    across = np.where(axis == 0, points[:, 1], points[:, 0])
-    along = np.where(axis == 2, points[:, 1], points[:, 2])
+    across = np.where(is_y | is_z, x, y)
+    along = np.where(is_z, y, z)
     place = []
     for side in (across, along):
         part = (np.arctan(side / np.abs(height)) * (2.0 / math.pi) + 0.5) * width

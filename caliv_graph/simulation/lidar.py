@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -107,6 +108,10 @@ class LidarReturns:
     beams: IntArray
 
 
+Drawn = tuple[Mapping[str, Any], Mapping[str, Any]]
+"""States of the streams of noise of a LiDAR: of ranges, and of what happens at edges."""
+
+
 class SimulatedLidar:
     """A LiDAR on the vehicle. Its random generator is the source of its noise only.
 
@@ -176,6 +181,14 @@ class SimulatedLidar:
         self._draw_noise()
         if self._model.edges is not None:
             self._draw_edges()
+
+    def drawn(self) -> Drawn:
+        """How far the noise has been drawn, for `continue_from`."""
+        return self._rng.bit_generator.state, self._edge_rng.bit_generator.state
+
+    def continue_from(self, drawn: Drawn) -> None:
+        """Goes to where another `SimulatedLidar` of the same drive was, without drawing."""
+        self._rng.bit_generator.state, self._edge_rng.bit_generator.state = drawn
 
     def columns_of(self, returns: LidarReturns) -> IntArray:
         """(n,) column of each return."""

@@ -17,7 +17,7 @@ from caliv_graph.scenario.model import Scenario
 from caliv_graph.scenario.sensor_models import LidarModel
 from caliv_graph.scenario.terrain import make_terrain
 from caliv_graph.scenario.world import World, make_world
-from caliv_graph.simulation.lidar import LidarReturns, SimulatedLidar
+from caliv_graph.simulation.lidar import Drawn, LidarReturns, SimulatedLidar
 from caliv_graph.simulation.motion import (
     SimulatedGnss,
     SimulatedImu,
@@ -115,6 +115,7 @@ class SimulatedRecording:
         self.seed = seed
         self.world: World = make_world(scenario.world, scenario.vehicle_body)
         self._threads = threads
+        self._drawn: dict[tuple[str, int], Drawn] = {}  # by LiDAR and frame
         drive = make_drive(scenario.drive, make_terrain(scenario.world.ground))
         last_ns = round(drive.duration_s * NANOSECONDS_PER_SECOND)
         height_m, heave_m = height_and_heave(
@@ -243,12 +244,15 @@ class SimulatedRecording:
             self.truth.range_bias_m[lidar],
             self.channel_errors.get(lidar),
         )
+        reached = 0
         for frame, stamp_ns in enumerate(self._frame_stamps(lidar).tolist()):
             absolute_ns = stamp_ns + self.truth.start_ns
             if wanted is not None and absolute_ns not in wanted:
-                simulated.skip()
                 continue
+            self._skip(lidar, simulated, reached, frame)
             returns, times_s = self._take(simulated, model, stamp_ns)
+            reached = frame + 1
+            self._drawn[lidar, reached] = simulated.drawn()
             yield SimulatedScan(
                 LidarScan(
                     lidar=lidar,
@@ -260,6 +264,18 @@ class SimulatedRecording:
                 frame,
                 returns.objects,
             )
+
+    def _skip(self, lidar: str, simulated: SimulatedLidar, first: int, frame: int) -> None:
+        """Skips the frames from the `first` to one that is wanted.
+
+        Clouds are asked for several times. Noise that was drawn before is not drawn again.
+        """
+        known = next((f for f in range(frame, first, -1) if (lidar, f) in self._drawn), first)
+        if known > first:
+            simulated.continue_from(self._drawn[lidar, known])
+        for skipped in range(known, frame):
+            simulated.skip()
+            self._drawn[lidar, skipped + 1] = simulated.drawn()
 
     def _take(
         self, simulated: SimulatedLidar, model: LidarModel, stamp_ns: int

@@ -184,6 +184,22 @@ def test_wanted_scans_are_what_they_are_among_all(case: str) -> None:
             )
 
 
+def test_scans_do_not_depend_on_which_were_asked_for_before() -> None:
+    noisy = FRONT.model_copy(update={"range_sigma_m": 0.02, "edges": EdgeModel()})
+    scenario = scenario_of(lidars={"front": noisy, "side": noisy})
+    whole = simulate_drive(scenario, 0)
+    everything = {scan.stamp_ns: scan.points_lidar for scan in whole.scans("front")}
+    stamps = list(everything)
+    recording = simulate_drive(scenario, 0)
+    for wanted in ([5], [9, 11], [3, 4, 10], [6, 12, 80], [0, 80]):
+        for lidar, alike in (("front", True), ("side", False)):
+            scans = list(recording.scans(lidar, [stamps[n] for n in wanted]))
+            assert [scan.stamp_ns for scan in scans] == [stamps[n] for n in wanted]
+            for scan in scans:
+                same = np.array_equal(scan.points_lidar, everything[scan.stamp_ns])
+                assert same == alike
+
+
 def test_sweeps_lie_within_the_drive_and_tell_their_times() -> None:
     recording = simulate_drive(scenario_of(**CASES["sweep"]), 0)
     truth = recording.truth

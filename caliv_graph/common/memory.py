@@ -17,7 +17,7 @@ they leave behind in pieces is not used again: with 32 MiB a solve of structure 
 
 LARGEST_KEPT_WHILE_REGISTERING = 32 * 2**20
 """The same while clouds are registered, where sums over clouds and surfels are as large as this;
-glibc allows no more. With three LiDARs it saves 8 percent of a calibration, at the same peak."""
+glibc allows no more. With three LiDARs it saves 4 to 8 percent of a calibration, same peak."""
 
 MOST_KEPT = 512 * 2**20
 """Free bytes at the end of the heap that are kept: the working set of the largest calibrations."""

@@ -205,6 +205,7 @@ def fitted_noise(
         errors: (D,) estimated errors of the LiDARs.
         ranges: what is stated of the errors of the ranges.
         level: (K,) which strips are ground; it bends otherwise than walls.
+        tilts: whether errors of tilts have sizes of their own; else those of offsets.
     """
     offsets = geometry.offsets_m(sightings)
     sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)

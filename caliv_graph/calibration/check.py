@@ -15,6 +15,7 @@ from caliv_graph.calibration.robust import FAR_OFF
 from caliv_graph.calibration.score_tests import MIN_YAW_RATE_RAD_S, score_tests
 from caliv_graph.calibration.suspect_values import ranked_suspects
 from caliv_graph.config.model import Config
+from caliv_graph.conventions import key_vehicle
 from caliv_graph.errors import SolveError, TrajectoryError
 from caliv_graph.products import (
     Array,
@@ -25,6 +26,7 @@ from caliv_graph.products import (
     Solution,
     Suspect,
 )
+from caliv_graph.trajectory.factors import POSE_SIZE
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -36,6 +38,7 @@ from caliv_graph.uncertainty.consistency import (
     Contradiction,
     GuessContradiction,
     ScoreTest,
+    Strain,
 )
 from caliv_graph.wording.contradictions import contradiction_sentence
 from caliv_graph.wording.offsets import late_clock_sentences
@@ -105,6 +108,7 @@ def check(
                 for index, heading in headings.items()
             ],
             speed_m_s=typical_speed(solution, trajectories),
+            strains=strains(solution, drives),
         )
     )
     calibration = replace(calibration, suspects=suspects)
@@ -258,6 +262,22 @@ def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...
         for axis, value, sigma in zip(axes, raw.tolist(), sigmas.tolist(), strict=True):
             if value:
                 out.append(Assumed(drive, axis, value, abs(sigma)))
+    return tuple(out)
+
+
+def strains(solution: Solution, drives: Sequence[str]) -> tuple[Strain, ...]:
+    """How far the poses of each smoothed drive are from where its motion data have them."""
+    of_poses = [drive for drive, _ in solution.T_map_vehicle]
+    of_vehicle = gtsam.symbolChr(key_vehicle(0))
+    out = []
+    for index, kind in enumerate(solution.factor_kinds):
+        if kind == "motion":
+            factor: Any = solution.graph.at(index)
+            keys = list(factor.keys())
+            poses = [key for key in keys if gtsam.symbolChr(key) == of_vehicle]
+            chi_square = 2.0 * float(factor.error(solution.values))
+            drive = drives[of_poses[gtsam.symbolIndex(poses[0])]]
+            out.append(Strain(drive, chi_square, POSE_SIZE * len(poses)))
     return tuple(out)
 
 

@@ -26,6 +26,7 @@ from caliv_graph.uncertainty.consistency import (
     Heading,
     ScoreTest,
     ScoreTestKind,
+    Strain,
     against_guesses,
     assumption_contradicted,
     contradictions,
@@ -251,3 +252,21 @@ def test_together_the_tests_seldom_err() -> None:
         ]
         counts = [counted(int(rng.binomial(80, OUTLIERS))) for _ in lidars]
         assert not contradictions(CheckInputs(lidars, score_tests, counts, registration_scale=1.5))
+
+
+@pytest.mark.parametrize(
+    ("chi_square", "coordinates", "contradicted"),
+    [
+        (500.0, 960, False),  # all sigmas right
+        (1200.0, 960, False),  # beyond chance, but sigmas are not known to a tenth
+        (2800.0, 960, True),
+        (75.0, 18, True),
+        (14.0, 6, False),  # large, but chance does it
+    ],
+)
+def test_poses_far_from_the_motion_data_contradict_them(
+    chi_square: float, coordinates: int, contradicted: bool
+) -> None:
+    strain = Strain("drive", chi_square, coordinates)
+    found = contradictions(CheckInputs(lidars={}, strains=[strain]))
+    assert found == ((strain,) if contradicted else ())

@@ -18,6 +18,7 @@ from caliv_graph.uncertainty.consistency import (
     RangesDisagree,
     ScoreTest,
     ScoreTestKind,
+    Strain,
 )
 from caliv_graph.wording.contradictions import contradiction_sentence
 from tests.samples import MOUNTINGS, pose
@@ -163,3 +164,12 @@ def test_ranges_that_disagree_give_no_advice_after_a_suspect() -> None:
     alone, after = contradiction_sentence(found), contradiction_sentence(found, led=True)
     assert alone.startswith(f"{after}. Check the range calibration of the LiDARs")
     assert after.endswith("off by at least 13 mm (1 sigma; limit 10 mm)")
+
+
+def test_poses_that_are_strained_come_with_the_keys_of_the_noise() -> None:
+    found = Strain("drive", 3844.0, 961)
+    text = contradiction_sentence(found)
+    assert "drive 'drive'" in text
+    assert "2.0 times" in text
+    assert "gyroscope_density_rad_s_sqrthz" in text
+    assert "data sheets" not in contradiction_sentence(found, led=True)

@@ -230,10 +230,7 @@ def fitted_noise(
         _strip_sigmas(asked, layout, nuisances.strip, errors), ONE_VIEW_M if one else LEAST_M
     )
     sighting = np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2))
-    if one:
-        own_tilt = sighting / lengths_m(level)
-        strip_tilt = ONE_VIEW_M / lengths_m(level)
-    elif not tilts:
+    if one or not tilts:
         own_tilt, strip_tilt = sighting / lengths_m(level), strip / lengths_m(level)
     else:
         known = nuisances.sighting_tilt, nuisances.strip_tilt

@@ -65,7 +65,7 @@ def tilts_of(
     4 cm and 10 mm.
     """
     moments, noise = sightings.moments[own], sightings.noise[own]
-    axes = geometry.by[own][:, PLANE_ROWS][:, :2, :3]
+    axes = geometry.by[:, PLANE_ROWS][own][:, :2, :3]
     N = np.zeros((len(moments), 4, 3))
     N[:, 3, 0] = 1.0
     N[:, :3, 1:] = np.swapaxes(axes, 1, 2)
@@ -122,17 +122,18 @@ def fitted_tilts(
         length_m = _length(tilts[own], variances[own], free[own], key[own], sighting_m[strip[own]])
         if length_m is not None:
             own_rad[of] = sighting_m[of] / length_m
-        known, mean = np.zeros((2, size)), np.zeros((2, size))
+        known, mean, left = np.zeros((3, 2, size))
         for i in range(2):
             w = 1.0 / (variances[own, i] + own_rad[strip[own]] ** 2)
             known[i] = np.bincount(key[own], w, size)
             mean[i] = np.bincount(key[own], w * tilts[own, i], size)
+            left[i] = np.bincount(key[own], w * free[own, i], size)
         mean /= np.maximum(known, 1e-12)
+        left /= np.maximum(known, 1e-12)
         shape = (2, len(level), lidars)
         if of.any():
-            repeated[of] = _repeated(
-                known.reshape(shape)[:, of], mean.reshape(shape)[:, of], repeated[of]
-            )
+            told, tilt, share = (part.reshape(shape)[:, of] for part in (known, mean, left))
+            repeated[of] = _repeated(told, tilt, share, repeated[of])
     return own_rad, repeated
 
 
@@ -143,7 +144,7 @@ def _without_turns(
 
     `scan` (Q,) is that of each sighting, `at` (n,) are those that have the tilts.
     """
-    axes = geometry.by[at][:, PLANE_ROWS][:, :2, :3]
+    axes = geometry.by[:, PLANE_ROWS][at][:, :2, :3]
     by_turn = np.cross(geometry.normals_lidar[at][:, None], axes)
     weighted = by_turn / variances[:, :, None]
     _, number = np.unique(scan[at], return_inverse=True)
@@ -181,12 +182,13 @@ def _length(
     return math.exp(0.5 * (low + high))
 
 
-def _repeated(known: Array, mean: Array, before: Array) -> Array:
+def _repeated(known: Array, mean: Array, left: Array, before: Array) -> Array:
     """(K,) sigmas of what each LiDAR repeats of the tilt of each of K strips.
 
     Args:
         known: (2, K, L) information of each LiDAR on each of the two tilts, 1/rad^2.
         mean: (2, K, L) these, rad.
+        left: (2, K, L) how much of them is left without the turns of scans, 0 to 1.
         before: (K,) the sigmas before.
     """
     seen = known > 0.0
@@ -198,7 +200,7 @@ def _repeated(known: Array, mean: Array, before: Array) -> Array:
         # The strip's own tilt is free.
         middle = (w * mean).sum(axis=2, keepdims=True) / total
         errors = variance * w * (mean - middle)
-        told = np.where(seen, variance * w * (1.0 - w / total), 0.0)
+        told = np.where(seen, left * variance * w * (1.0 - w / total), 0.0)
         sigma = heavy_tailed(
             told.sum(axis=(0, 2)),
             (errors**2).sum(axis=(0, 2)),

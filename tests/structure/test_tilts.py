@@ -1,5 +1,7 @@
 """Tilts of sightings: their noise, and what LiDARs repeat of it, against known sizes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.tilts import USUAL_RAD, fitted_tilts
 
 STRIPS, LIDARS, SCANS = 80, 2, 12
+FEW = 4
 OFFSET_M, OWN_RAD, REPEATED_RAD = 4e-4, 1.6e-3, 7e-4
 
 
@@ -98,3 +101,14 @@ def test_robust_weights_count() -> None:
     before = np.full(STRIPS, 1e-3), np.full(STRIPS, 4e-4)
     own, _ = fitted_tilts(bent, geometry, lidar, weights, walls, offset, before)
     assert own == pytest.approx(OWN_RAD, rel=0.05)
+
+
+def test_scans_of_few_strips_say_less_of_what_is_repeated() -> None:
+    """The turn of each scan takes a part of the tilts of its four strips with it."""
+    sightings, geometry, lidar = seen(LIDARS)
+    few = replace(sightings, scan=sightings.scan + 1000 * (sightings.strip // FEW))
+    before = np.full(STRIPS, 1e-3), np.full(STRIPS, 4e-4)
+    walls, weights = np.zeros(STRIPS, np.bool_), np.ones(sightings.count)
+    offset = np.full(STRIPS, OFFSET_M)
+    _, repeated = fitted_tilts(few, geometry, lidar, weights, walls, offset, before)
+    assert np.sqrt(np.mean(repeated**2)) == pytest.approx(REPEATED_RAD, rel=0.2)

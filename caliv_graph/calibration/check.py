@@ -11,11 +11,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.robust import FAR_OFF
 from caliv_graph.calibration.score_tests import MIN_YAW_RATE_RAD_S, score_tests
 from caliv_graph.calibration.suspect_values import ranked_suspects
 from caliv_graph.config.model import Config
-from caliv_graph.conventions import key_vehicle
 from caliv_graph.errors import SolveError, TrajectoryError
 from caliv_graph.products import (
     Array,
@@ -26,7 +26,6 @@ from caliv_graph.products import (
     Solution,
     Suspect,
 )
-from caliv_graph.trajectory.factors import POSE_SIZE
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -164,7 +163,7 @@ def unexplained(
                 name = f"lidars.{each.lidar}.mount.{each.kind}"
             case Assumed(kind="height"):
                 name = "ground.vehicle_height"
-            case consistency.Heading():
+            case consistency.Heading() | Strain():
                 return not suspects[0].input.startswith(_MOTION_INPUTS)
             case _:
                 return True
@@ -268,16 +267,15 @@ def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...
 def strains(solution: Solution, drives: Sequence[str]) -> tuple[Strain, ...]:
     """How far the poses of each smoothed drive are from where its motion data have them."""
     of_poses = [drive for drive, _ in solution.T_map_vehicle]
-    of_vehicle = gtsam.symbolChr(key_vehicle(0))
+    of_motion = [k for k, kind in enumerate(solution.factor_kinds) if kind == "motion"]
+    keys = {frozenset(solution.graph.at(index).keys()) for index in of_motion}
     out = []
-    for index, kind in enumerate(solution.factor_kinds):
-        if kind == "motion":
-            factor: Any = solution.graph.at(index)
-            keys = list(factor.keys())
-            poses = [key for key in keys if gtsam.symbolChr(key) == of_vehicle]
-            chi_square = 2.0 * float(factor.error(solution.values))
-            drive = drives[of_poses[gtsam.symbolIndex(poses[0])]]
-            out.append(Strain(drive, chi_square, POSE_SIZE * len(poses)))
+    graph = solution.graph
+    for gaussian in graph.gaussians if isinstance(graph, CalibrationGraph) else ():
+        if frozenset(gaussian.keys) in keys:
+            drive = drives[of_poses[gtsam.symbolIndex(gaussian.keys[0])]]
+            chi_square = gaussian.chi_square(solution.values)
+            out.append(Strain(drive, chi_square, len(gaussian.information)))
     return tuple(out)
 
 

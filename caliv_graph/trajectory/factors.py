@@ -298,6 +298,21 @@ class Gaussian:
         a pose is turned. Where a direction is open, all poses move together by hundredths of a
         radian, and what is known to hundredths of a milliradian would seem to tell of it.
         """
+        d, blocks = self._apart(values)
+        H = _by_blocks(blocks, _by_blocks(blocks, self.information).T)
+        b = _by_blocks(blocks, (self.gradient - self.information @ d)[:, None])[:, 0]
+        return 0.5 * (H + H.T), b
+
+    def chi_square(self, values: gtsam.Values) -> float:
+        """Twice its error at `values`, which those of `factor` have in logarithms of all poses.
+
+        A vehicle that is turned by 50 mrad and shifted by a metre seems to heave by 25 mm there.
+        """
+        d, _ = self._apart(values)
+        return float(d @ self.information @ d - 2.0 * self.gradient @ d + self.constant)
+
+    def _apart(self, values: gtsam.Values) -> tuple[Array, list[Array]]:
+        """D (n,) from the means, and its derivative by right perturbations, block by block."""
         apart, blocks = [], []
         for key, mean in zip(self.keys, self.means, strict=True):
             if isinstance(mean, gtsam.Pose3):
@@ -320,10 +335,7 @@ class Gaussian:
             moved = np.array([apart[k] for k in poses]).reshape(-1, 6)
             for k, block in zip(poses, self.chart.derivatives(moved), strict=True):
                 blocks[k] = block
-        d = np.concatenate(apart)
-        H = _by_blocks(blocks, _by_blocks(blocks, self.information).T)
-        b = _by_blocks(blocks, (self.gradient - self.information @ d)[:, None])[:, 0]
-        return 0.5 * (H + H.T), b
+        return np.concatenate(apart), blocks
 
 
 def _by_blocks(blocks: Sequence[Array], rows: Array) -> Array:

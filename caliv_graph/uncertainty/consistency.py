@@ -53,9 +53,10 @@ accuracy of 20 to 30 mm mostly, which is taken for two to three sigmas."""
 
 STRAIN_LIMIT = 1.5
 """Distance of the vehicle's poses from where the motion data have them, in their sigmas (root of
-chi-square over the number of coordinates). Where all sigmas are right it is below 1: of four drives
-of another simulator 0.6 to 0.8. Two that ended with rolls and pitches wrong by 5 to 13 mrad, the
-noise of the gyroscope thought to be a third of what it was, had 1.7 and 2.3."""
+chi-square over the number of coordinates). Where all sigmas are right it is below 1: 0.3 to 0.7 in
+nine drives of two simulators with a target, 1.0 and 1.3 in two without. Two that ended with rolls
+and pitches wrong by 5 to 13 mrad, the noise of the gyroscope thought to be a third of what it was,
+had 1.7 and 2.5."""
 
 OUTLIERS = 0.1
 """Fraction of a LiDAR's clouds that may be outliers: the paper's k = 10 percent."""
@@ -177,7 +178,7 @@ class Strain:
     Attributes:
         drive: its name.
         chi_square: of the poses of the graph, by the joint Gaussian of the motion data.
-        coordinates: of these poses, six each.
+        coordinates: of these poses, six each, and of the parameters that it has besides.
     """
 
     drive: str

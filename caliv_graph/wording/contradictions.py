@@ -61,15 +61,16 @@ def contradiction_sentence(found: Contradiction, led: bool = False) -> str:
 
 def _strain(found: Strain, led: bool) -> str:
     advice = (
-        ": state the noise of the IMU, the fixes and the orientation by the data sheets (noise in "
-        "the config: gyroscope_density_rad_s_sqrthz, accelerometer_density_m_s2_sqrthz, "
-        "gnss_horizontal_m, orientation_deg), and check the IMU's stamps and mounting"
+        ". The noise of the motion data is larger than it was taken for, or clocks or fixed "
+        "mounts of LiDARs are wrong: state the noise of the IMU, the fixes and "
+        "the orientation by the data sheets (noise in the config: gyroscope_density_rad_s_sqrthz, "
+        "accelerometer_density_m_s2_sqrthz, gnss_horizontal_m, orientation_deg), and check "
+        "the IMU's stamps and mounting"
     )
     return (
         f"drive '{found.drive}': the LiDARs put the vehicle's poses {found.sigmas:.1f} times as "
-        "far from where the motion data have them as their noise allows (1 at most): the noise of "
-        "the motion data is larger than it was taken for, and S2V may be off by many of its sigmas"
-        f"{'' if led else advice}"
+        "far from where the motion data have them as their noise allows (1 at most); S2V may be "
+        f"off by many of its sigmas{'' if led else advice}"
     )
 
 

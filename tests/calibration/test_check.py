@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.check import strains, unexplained
+from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.vehicle_parameters import KEYS
 from caliv_graph.conventions import key_vehicle
+from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.products import Solution, Suspect
 from caliv_graph.trajectory.factors import Gaussian
 from caliv_graph.trajectory.parameters import LEVER_ARM
@@ -41,12 +43,19 @@ def test_strains_are_those_of_the_poses_of_each_drive() -> None:
     sigma = np.array([1e-3] * 3 + [0.01] * 3)
     poses = [gtsam.Pose3.Expmap(np.full(6, 0.1 * i)) for i in range(3)]
     arm = np.array([0.1, 0.2, 0.3])
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph, values = CalibrationGraph(), gtsam.Values()
+    chart = PoseChart()
     keys = (key_vehicle(0), key_vehicle(1), KEYS[LEVER_ARM.name])
     H = np.diag(np.concatenate([sigma**-2.0, sigma**-2.0, np.full(3, 1e4)]))
-    graph.add(Gaussian(keys, (*poses[:2], arm), H, np.zeros(15)).factor())
-    graph.add(gtsam.PriorFactorVector(KEYS[LEVER_ARM.name], arm, gtsam.noiseModel.Unit.Create(3)))
-    graph.add(Gaussian((key_vehicle(2),), (poses[2],), np.diag(sigma**-2.0), np.zeros(6)).factor())
+    first = Gaussian(keys, (*poses[:2], arm), H, np.zeros(15), chart=chart)
+    graph.append_gaussian("motion", first)
+    prior = gtsam.PriorFactorVector(KEYS[LEVER_ARM.name], arm, gtsam.noiseModel.Unit.Create(3))
+    graph.append("vehicle_parameter", prior)
+    other = Gaussian((keys[0],), (poses[0],), 1e6 * np.eye(6), np.ones(6))
+    graph.append_gaussian("structure", other)
+    last = np.diag(sigma**-2.0)
+    second = Gaussian((key_vehicle(2),), (poses[2],), last, np.zeros(6), chart=chart)
+    graph.append_gaussian("motion", second)
     values.insert(key_vehicle(0), poses[0])
     values.insert(key_vehicle(1), poses[1].retract(3.0 * sigma))
     values.insert(key_vehicle(2), poses[2].retract(2.0 * sigma))
@@ -54,11 +63,28 @@ def test_strains_are_those_of_the_poses_of_each_drive() -> None:
     solution = SimpleNamespace(
         graph=graph,
         values=values,
-        factor_kinds=("motion", "vehicle_parameter", "motion"),
+        factor_kinds=tuple(graph.kinds),
         T_map_vehicle={(0, 10): None, (0, 20): None, (1, 10): None},
     )
-    first, second = strains(cast(Solution, solution), ["morning", "noon"])
-    assert (first.drive, first.coordinates) == ("morning", 12)
-    assert first.chi_square == pytest.approx(54.0, rel=1e-3)
-    assert (second.drive, second.coordinates) == ("noon", 6)
-    assert second.sigmas == pytest.approx(2.0, rel=1e-3)
+    morning, noon = strains(cast(Solution, solution), ["morning", "noon"])
+    assert (morning.drive, morning.coordinates) == ("morning", 15)
+    assert morning.chi_square == pytest.approx(54.0, rel=1e-3)
+    assert (noon.drive, noon.coordinates) == ("noon", 6)
+    assert noon.sigmas == pytest.approx(2.0, rel=1e-3)
+
+
+def test_a_turn_of_all_poses_beside_a_shift_is_no_heave() -> None:
+    """A rotation of the IMU that nobody knows, fixes that wander by a metre; heave of 3 mm."""
+    sigma = np.array([0.1] * 3 + [1.0, 1.0, 3e-3])
+    mean, key = gtsam.Pose3(), key_vehicle(0)
+    graph, values = CalibrationGraph(), gtsam.Values()
+    gaussian = Gaussian((key,), (mean,), np.diag(sigma**-2.0), np.zeros(6), chart=PoseChart())
+    graph.append_gaussian("motion", gaussian)
+    turned = gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.05, 0.0, 0.0])), np.array([0.0, 1.0, 0.0]))
+    values.insert(key, turned)
+    solution = SimpleNamespace(
+        graph=graph, values=values, factor_kinds=("motion",), T_map_vehicle={(0, 10): None}
+    )
+    (found,) = strains(cast(Solution, solution), ["drive"])
+    assert found.chi_square == pytest.approx(1.25, rel=1e-6)
+    assert 2.0 * gaussian.factor().error(values) > 50.0

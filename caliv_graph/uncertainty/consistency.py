@@ -56,8 +56,7 @@ STRAIN_LIMIT = 2.0
 chi-square over the number of coordinates). Where all sigmas are right it is below 1: 0.3 to 0.7 in
 nine drives of two simulators with a target, 1.0 and 1.3 in two without. Two that ended with rolls
 and pitches wrong by 5 to 13 mrad, the noise of the gyroscope thought to be a third of what it was,
-had 1.7 and 2.5; the
-latter drive, right once the noise of its IMU is stated, 1.6."""
+had 1.7 and 2.5; the latter drive, right once the noise of its IMU is stated, 1.6."""
 
 OUTLIERS = 0.1
 """Fraction of a LiDAR's clouds that may be outliers: the paper's k = 10 percent."""

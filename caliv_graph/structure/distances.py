@@ -37,7 +37,6 @@ from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.solve import GATES_M, Solved
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.thickness import plane_rows, thickness_m, weighted_alike
-from caliv_graph.structure.tilts import USUAL_RAD
 
 OWN_SIGHTINGS = 3
 """Fewest sightings of a strip with which a LiDAR's distance is measured."""
@@ -132,7 +131,7 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
         sighting=sighting,
         sighting_tilt=sighting * np.where(strips.level, *levels.tilt_per_m),
         strip=strip,
-        strip_tilt=np.where(strips.level, *(levels.strip_tilt_rad or (USUAL_RAD, USUAL_RAD))),
+        strip_tilt=np.where(strips.level, *levels.strip_tilt_rad),
         bend=np.where(strips.level, *levels.bend_per_m),
     )
     weights = robust_weights(own, sightings, nuisances)

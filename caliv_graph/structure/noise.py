@@ -19,7 +19,7 @@ from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.sightings import Sightings
-from caliv_graph.structure.tilts import fitted_tilts, lengths_m, tilts_of
+from caliv_graph.structure.tilts import first_tilts_per_m, fitted_tilts, tilts_of
 from caliv_graph.structure.views import Views
 
 FIRST_SIGHTING_M = 0.01
@@ -231,7 +231,8 @@ def fitted_noise(
     )
     sighting = np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2))
     if one or not tilts:
-        own_tilt, strip_tilt = sighting / lengths_m(level), strip / lengths_m(level)
+        per_m = first_tilts_per_m(level)
+        own_tilt, strip_tilt = sighting * per_m, strip * per_m
     else:
         known = nuisances.sighting_tilt, nuisances.strip_tilt
         own_tilt, strip_tilt = fitted_tilts(

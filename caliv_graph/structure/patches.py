@@ -203,7 +203,11 @@ def along_surface(moments: Array, normals: Array) -> Array:
 
     Of moments (N, 4, 4), on surfaces with these normals (N, 3).
     """
-    axes = tangent_axes(normals)
+    return along_axes(moments, tangent_axes(normals))
+
+
+def along_axes(moments: Array, axes: Array) -> Array:
+    """`along_surface` along two axes (N, 2, 3) of each surface."""
     centroid = moments[:, :3, 3] / moments[:, 3, 3, None]
     out = np.zeros((len(moments), 4, 3))
     out[:, 3, 0] = 1.0

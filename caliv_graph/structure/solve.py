@@ -154,7 +154,7 @@ class Levels:
 
     `beams` is (E,), as of `Nuisances`, or None: as is usual. Pairs are of level strips, and of
     others: `bend_per_m`, tilts of sightings in offsets (`tilt_per_m`), and what a LiDAR repeats of
-    tilts (`strip_tilt_rad`; None: as of sightings).
+    tilts (`strip_tilt_rad`).
     """
 
     sighting_m: float
@@ -162,15 +162,18 @@ class Levels:
     shared_m: float
     surface_m: float
     bias_m: float
+    strip_tilt_rad: Pair
     beams: Array | None = None
     bend_per_m: Pair = (USUAL_PER_M, USUAL_PER_M)
     tilt_per_m: Pair = FIRST_TILT_PER_M
-    strip_tilt_rad: Pair | None = None
 
     @staticmethod
     def first(sighting_m: float, strip_m: float, shared_m: float, ranges: RangeErrors) -> Levels:
         """Some levels, and what is known of the ranges before any data."""
-        return Levels(sighting_m, strip_m, shared_m, ranges.surface_m, ranges.offsets.usual)
+        ground, others = FIRST_TILT_PER_M
+        strip_tilt_rad = strip_m * ground, strip_m * others
+        surface_m, bias_m = ranges.surface_m, ranges.offsets.usual
+        return Levels(sighting_m, strip_m, shared_m, surface_m, bias_m, strip_tilt_rad)
 
 
 def _medians(of_strips: Array, level: BoolArray, none: Pair) -> Pair:
@@ -360,10 +363,6 @@ def _round(
     state = replace(
         state, centres_map=strips.centres_map, normals_map=strips.normals_map, errors=errors
     )
-    tilt_per_m = np.where(strips.level, *levels.tilt_per_m)
-    strip_tilt = levels.strip_m * tilt_per_m
-    if levels.strip_tilt_rad is not None:
-        strip_tilt = np.where(strips.level, *levels.strip_tilt_rad)
     nuisances = Nuisances(
         bias=levels.bias_m,
         incidence=problem.range_errors.incidence_m,
@@ -371,8 +370,8 @@ def _round(
         surface=levels.surface_m,
         strip=np.full(strips.count, levels.strip_m),
         sighting=np.full(strips.count, levels.sighting_m),
-        sighting_tilt=levels.sighting_m * tilt_per_m,
-        strip_tilt=strip_tilt,
+        sighting_tilt=levels.sighting_m * np.where(strips.level, *levels.tilt_per_m),
+        strip_tilt=np.where(strips.level, *levels.strip_tilt_rad),
         shared=levels.shared_m,
         repeated=0.0,
         beams=usual_sigmas(layout.beams, problem.range_errors)

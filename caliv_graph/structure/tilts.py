@@ -13,23 +13,19 @@ import numpy as np
 
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.heavy_tails import heavy_tailed
+from caliv_graph.structure.patches import along_axes
 from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings
 
-TILT_LENGTH_M = 1.0
-"""Distance over which the error of a sighting changes by its own sigma, to begin with: half a
-strip. How beams fall on joints, edges and bumps differs over a strip as much as from scan to
-scan."""
-
-GROUND_TILT_LENGTH_M = 0.5
-"""The same on ground: the width of a patch. There a patch has three rings, each on bumps of its
-own; tilts of sightings are 2.3 mrad on streets of a simulator where offsets are 0.8 mm."""
-
-FIRST_TILT_PER_M = (1.0 / GROUND_TILT_LENGTH_M, 1.0 / TILT_LENGTH_M)
-"""Tilts of sightings of level strips and of others in their offsets, to begin with."""
+FIRST_TILT_PER_M = (2.0, 1.0)
+"""Tilts of sightings of level strips and of others in their offsets, to begin with. The error of a
+sighting changes by its own sigma over half a strip: how beams fall on joints, edges and bumps
+differs over a strip as much as from scan to scan. On ground over the width of a patch, which has
+three rings, each on bumps of its own: tilts of sightings are 2.3 mrad on streets of a simulator
+where offsets are 0.8 mm."""
 
 SHORTEST_M, LONGEST_M = 0.1, 10.0
-"""Bounds of that distance: a fifth of a patch, and walls as flat as glass."""
+"""Bounds of the distance over which it does: a fifth of a patch, and walls as flat as glass."""
 
 USUAL_RAD = 1e-3
 """1 sigma of what a LiDAR repeats of the tilt of a strip where nothing tells, which counts as one:
@@ -48,9 +44,9 @@ ROUNDS = 20
 """Steps of the likelihood of the sizes, each of which costs next to nothing."""
 
 
-def lengths_m(level: BoolArray) -> Array:
-    """(K,) distance over which the error of a sighting changes by its sigma, to begin with."""
-    return np.where(level, GROUND_TILT_LENGTH_M, TILT_LENGTH_M)
+def first_tilts_per_m(level: BoolArray) -> Array:
+    """(K,) `FIRST_TILT_PER_M` of strips, of which some are level."""
+    return np.where(level, *FIRST_TILT_PER_M)
 
 
 def tilts_of(
@@ -65,11 +61,7 @@ def tilts_of(
     4 cm and 10 mm.
     """
     moments, noise = sightings.moments[own], sightings.noise[own]
-    axes = geometry.by[:, PLANE_ROWS][own][:, :2, :3]
-    N = np.zeros((len(moments), 4, 3))
-    N[:, 3, 0] = 1.0
-    N[:, :3, 1:] = np.swapaxes(axes, 1, 2)
-    N[:, 3, 1:] = -np.einsum("qki,qi->qk", axes, sightings.centroids_lidar[own])
+    N = along_axes(moments, geometry.by[:, PLANE_ROWS][own][:, :2, :3])
     of_points = np.swapaxes(N, 1, 2)
     cov = np.linalg.inv(
         of_points @ moments @ N + np.diag([0.0, STEEPEST_RAD**-2.0, STEEPEST_RAD**-2.0])
@@ -106,7 +98,7 @@ def fitted_tilts(
         sighting_m: (K,) 1 sigma of the offset of each sighting.
         before: both before.
     """
-    own_rad, repeated = sighting_m / lengths_m(level), np.array(before[1])
+    own_rad, repeated = sighting_m * first_tilts_per_m(level), np.array(before[1])
     at = np.flatnonzero(weights > 0.5)
     if not len(at):
         return own_rad, repeated

@@ -267,12 +267,11 @@ def assumptions(solution: Solution, drives: Sequence[str]) -> tuple[Assumed, ...
 def strains(solution: Solution, drives: Sequence[str]) -> tuple[Strain, ...]:
     """How far the poses of each smoothed drive are from where its motion data have them."""
     of_poses = [drive for drive, _ in solution.T_map_vehicle]
-    of_motion = [k for k, kind in enumerate(solution.factor_kinds) if kind == "motion"]
-    keys = {frozenset(solution.graph.at(index).keys()) for index in of_motion}
-    out = []
-    graph = solution.graph
-    for gaussian in graph.gaussians if isinstance(graph, CalibrationGraph) else ():
-        if frozenset(gaussian.keys) in keys:
+    graph, out = solution.graph, []
+    if not isinstance(graph, CalibrationGraph):
+        return ()
+    for kind, gaussian in zip(graph.gaussian_kinds, graph.gaussians, strict=True):
+        if kind == "motion":
             drive = drives[of_poses[gtsam.symbolIndex(gaussian.keys[0])]]
             chi_square = gaussian.chi_square(solution.values)
             out.append(Strain(drive, chi_square, len(gaussian.information)))

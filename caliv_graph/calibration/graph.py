@@ -59,6 +59,7 @@ class CalibrationGraph(gtsam.NonlinearFactorGraph):
     Attributes:
         kinds: the kind of each of its factors, in order.
         gaussians: those on many poses at once.
+        gaussian_kinds: their kinds.
         others: all factors but these.
     """
 
@@ -66,6 +67,7 @@ class CalibrationGraph(gtsam.NonlinearFactorGraph):
         super().__init__()
         self.kinds: list[FactorKind] = []
         self.gaussians: list[Gaussian] = []
+        self.gaussian_kinds: list[FactorKind] = []
         self.others = gtsam.NonlinearFactorGraph()
 
     def append(self, kind: FactorKind, factor: gtsam.NonlinearFactor) -> None:
@@ -78,6 +80,7 @@ class CalibrationGraph(gtsam.NonlinearFactorGraph):
         """Adds a Gaussian on many poses at once."""
         self.add(gaussian.factor())
         self.gaussians.append(gaussian)
+        self.gaussian_kinds.append(kind)
         self.kinds.append(kind)
 
 
@@ -268,6 +271,7 @@ def merged(*graphs: CalibrationGraph) -> CalibrationGraph:
         out.others.push_back(graph.others)
         out.kinds += graph.kinds
         out.gaussians += graph.gaussians
+        out.gaussian_kinds += graph.gaussian_kinds
     return out
 
 

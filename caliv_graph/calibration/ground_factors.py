@@ -173,9 +173,8 @@ def ground_plane_factor(
         if moving is not None and twist is not None:
             said = said + moving.by_rates @ twist - moving.usual
         if jacobians is not None:
-            x, y, z = n_lidar.tolist()
             J = np.zeros((3, 6))
-            J[:2, :3] = axes @ np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+            J[:2, :3] = axes @ skew(n_lidar)
             J[2, 3:] = n_lidar
             jacobians[0] = J @ moves[0]
             if free:

@@ -90,7 +90,7 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
                 _swap(fresh, target, old)
         except OutputError as e:
             # A file in it is named where it will be: nobody finds it in the scratch folder.
-            raise OutputError(str(e).replace(str(fresh), str(path))) from None
+            raise OutputError(e.what.replace(str(fresh), str(path)), e.remedy) from None
         finally:
             with _uninterrupted():
                 shutil.rmtree(scratch, ignore_errors=True)

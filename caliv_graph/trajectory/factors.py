@@ -312,7 +312,7 @@ class Gaussian:
         return float(d @ self.information @ d - 2.0 * self.gradient @ d + self.constant)
 
     def _apart(self, values: gtsam.Values) -> tuple[Array, list[Array]]:
-        """D (n,) from the means, and its derivative by right perturbations, block by block."""
+        """Coordinates d (n,) from the means; derivatives by right perturbations, in blocks."""
         apart, blocks = [], []
         for key, mean in zip(self.keys, self.means, strict=True):
             if isinstance(mean, gtsam.Pose3):

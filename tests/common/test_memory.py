@@ -29,13 +29,19 @@ if keep_freed_memory():
 """
 
 
-def test_arrays_are_made_of_memory_that_was_freed() -> None:
+def usual_and_kept(program: str) -> tuple[int, int]:
+    """Page faults that a program prints, without and with memory that is kept."""
     done = subprocess.run(
-        [sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     if not done.stdout:
         pytest.skip("the system's library is not glibc")
     usual, kept = map(int, done.stdout.split())
+    return usual, kept
+
+
+def test_arrays_are_made_of_memory_that_was_freed() -> None:
+    usual, kept = usual_and_kept(FAULTS)
     assert kept < 0.05 * usual
 
 
@@ -62,12 +68,7 @@ if keep_freed_memory():
 
 
 def test_larger_arrays_are_kept_for_a_while() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", LARGER], capture_output=True, text=True, check=True
-    )
-    if not done.stdout:
-        pytest.skip("the system's library is not glibc")
-    usual, kept = map(int, done.stdout.split())
+    usual, kept = usual_and_kept(LARGER)
     assert kept < 0.05 * usual
 
 

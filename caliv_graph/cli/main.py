@@ -84,24 +84,46 @@ def _options(
 
 
 class _Interrupts:
-    """Turns SIGINT and SIGTERM into KeyboardInterrupt, which native code may replace."""
+    """Turns SIGINT and SIGTERM into KeyboardInterrupt, which native code may replace or swallow.
+
+    Python swallows it where nothing can take it, in a destructor or a callback from C, and tells
+    `sys.unraisablehook`. The signal is then sent once more, a moment later.
+    """
+
+    _ONCE_MORE_S = 0.02
 
     def __init__(self) -> None:
-        self.came = False
+        self.came = 0
+        """Number of the last signal; 0: none came."""
 
     def __enter__(self) -> Self:
         # SIGINT too: a shell without job control starts programs with '&' that ignore it.
         numbers = (signal.SIGINT, signal.SIGTERM)
         self._before = {number: signal.signal(number, self._on_signal) for number in numbers}
+        self._before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._send_once_more)
+        self._hook_before = sys.unraisablehook
+        sys.unraisablehook = self._on_unraisable
         return self
 
     def __exit__(self, *_: object) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        sys.unraisablehook = self._hook_before
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.came = True
+        self.came = number
         raise KeyboardInterrupt
+
+    def _on_unraisable(self, what: sys.UnraisableHookArgs) -> None:
+        if self.came and issubclass(what.exc_type, KeyboardInterrupt):
+            signal.setitimer(signal.ITIMER_REAL, self._ONCE_MORE_S)
+        else:
+            self._hook_before(what)
+
+    def _send_once_more(self, number: int, frame: FrameType | None) -> None:
+        # Not raised here: whoever ignores the signal at the moment has a reason.
+        signal.raise_signal(self.came)
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -220,6 +220,35 @@ def test_what_is_interrupted_before_its_last_step_is_not_there(
         assert digest(tmp_path) == before
 
 
+_WHERE_IT_IS_SWALLOWED = """
+import ctypes, signal, time
+@ctypes.CFUNCTYPE(None)
+def from_c():
+    signal.raise_signal({number})
+def calibrate(recordings, config, progress, prior):
+    from_c()
+    time.sleep(20.0)
+    return run_of(make_calibration())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_nothing_can_take_comes_once_more(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    """Python prints "Exception ignored in" for one in a callback from C, and goes on."""
+    commands.write_drive(tmp_path / "drive")
+    config = commands.write_config(tmp_path / "config.yaml")
+    out = tmp_path / "out"
+    pipeline = _WHERE_IT_IS_SWALLOWED.format(number=int(number))
+
+    process = start("calibrate", config, "--out", out, pipeline=pipeline)
+    _, err = process.communicate(timeout=60)
+
+    assert (process.returncode, err) == (130, "error: interrupted\n")
+    assert not out.exists()
+
+
 # ------------------------------------------------------------------ no place
 
 

@@ -287,11 +287,9 @@ def _levels(
     out = [NoiseLevel(name, value, unit, source(name)) for name, value, unit in figures]
     for error in noise.correlated:
         unit = "m" if error.kind == "gnss" else "rad"
-        parts = {"horizontal": error.sigmas[0], "vertical": error.sigmas[2]}
-        if error.kind == "orientation":
-            parts = {"": error.sigmas[0]}
-        for part, sigma in parts.items():
-            name = "_".join(filter(None, (error.kind, "correlated", part)))
+        parts = ("horizontal", "vertical") if error.kind == "gnss" else ("tilt", "yaw")
+        for part, sigma in zip(parts, error.sigmas[::2], strict=True):
+            name = f"{error.kind}_correlated_{part}"
             told = OPEN if error.kind in noise.opened else "residuals of the LiDARs"
             out.append(NoiseLevel(name, sigma, unit, told, error.time_s))
     return tuple(out)
@@ -407,7 +405,7 @@ def _looked_for(noise: NoiseConfig, evidence: Evidence) -> list[str]:
     """Kinds of correlated errors that the config leaves open and a drive has."""
     configured = {
         "gnss": (noise.gnss_correlated_horizontal_m, noise.gnss_correlated_vertical_m),
-        "orientation": (noise.orientation_correlated_deg,),
+        "orientation": (noise.orientation_correlated_deg, noise.orientation_correlated_yaw_deg),
     }
     has = {kind for _, of in evidence.effects for kind in of} | evidence.sensor_sigmas.keys()
     return [k for k, values in configured.items() if k in has and all(v is None for v in values)]

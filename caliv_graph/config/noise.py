@@ -66,8 +66,11 @@ class NoiseConfig(Section):
     )
     orientation_correlated_deg: NonNegative | None = Field(
         None,
-        description="degrees, first-order Gauss-Markov error of the IMU's orientation, per map "
-        "axis; absent: estimated; 0: none",
+        description="degrees, first-order Gauss-Markov error of the IMU's orientation, about every "
+        "map axis; absent: estimated; 0: none",
+    )
+    orientation_correlated_yaw_deg: NonNegative | None = Field(
+        None, description="degrees, the same about the vertical; absent: as about the others"
     )
     orientation_correlation_s: Positive | None = Field(
         None, description="seconds, its correlation time; absent: estimated"

@@ -30,7 +30,7 @@ MOVES = {"gnss": slice(3, 6), "orientation": slice(0, 3)}
 
 GROUPS: Mapping[str, tuple[tuple[int, ...], ...]] = {
     "gnss": ((0, 1), (2,)),
-    "orientation": ((0, 1, 2),),
+    "orientation": ((0, 1), (2,)),
 }
 """Kind of factor -> the map axes along which the errors of its sensor are as large."""
 

@@ -325,7 +325,7 @@ def preintegrate(
     middle_force = np.einsum("nij,nj->ni", half_turn, middle_force)
     first = np.searchsorted(edges, nodes_ns)
     out = []
-    for i, gap_s in enumerate(_bridged(inertial, nodes_ns).tolist()):
+    for i, gap_s in enumerate(bridged_s(inertial, nodes_ns).tolist()):
         parameters = plain if gap_s == 0.0 else _parameters(noise, gravity_m_s2, gap_s)
         measured = gtsam.PreintegratedCombinedMeasurements(parameters, biases[i])
         for k in range(first[i], first[i + 1]):
@@ -334,7 +334,7 @@ def preintegrate(
     return out
 
 
-def _bridged(inertial: Inertial, nodes_ns: IntArray) -> Array:
+def bridged_s(inertial: Inertial, nodes_ns: IntArray) -> Array:
     """(n - 1,) length in seconds of the gap in which an interval lies, 0: none."""
     out = np.zeros(len(nodes_ns) - 1)
     for a, b in inertial.gaps_ns.tolist():

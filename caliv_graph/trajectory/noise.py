@@ -37,7 +37,7 @@ TYPICAL_CORRELATION_S = 30.0
 """Correlation time of the errors of a receiver with corrections (the troposphere and multipath of a
 moving antenna) and of an AHRS, where neither config nor data give one."""
 
-MIN_CORRELATED_M = 1e-4
+MIN_CORRELATED_M, MIN_CORRELATED_RAD = 1e-4, 1e-6
 """1 sigma that stands for no error: below what any sensor resolves."""
 
 
@@ -221,8 +221,10 @@ def configured_errors(config: Config) -> tuple[CorrelatedError, ...]:
         sigmas = [v if v else MIN_CORRELATED_M for v in (horizontal or 0.0, vertical or 0.0)]
         time_s = noise.gnss_correlation_s or TYPICAL_CORRELATION_S
         out.append(CorrelatedError("gnss", (sigmas[0], sigmas[0], sigmas[1]), time_s))
-    if noise.orientation_correlated_deg:
-        sigma = math.radians(noise.orientation_correlated_deg)
+    level, yaw = noise.orientation_correlated_deg, noise.orientation_correlated_yaw_deg
+    yaw = level if yaw is None else yaw
+    if level or yaw:
+        tilt, turn = (math.radians(v) if v else MIN_CORRELATED_RAD for v in (level, yaw))
         time_s = noise.orientation_correlation_s or TYPICAL_CORRELATION_S
-        out.append(CorrelatedError("orientation", (sigma, sigma, sigma), time_s))
+        out.append(CorrelatedError("orientation", (tilt, tilt, turn), time_s))
     return tuple(out)

@@ -256,6 +256,25 @@ SECOND_ARM = InputParameter(
 """The second antenna in the vehicle frame. The residuals are linear in it."""
 
 
+def _response_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    up = np.asarray(data.T_vehicle_imu.rotation().unrotate(np.array([0.0, 0.0, 1.0])))
+    gyro = data.inertial.gyro - np.outer(data.inertial.gyro @ up, d)
+    return replace(data, inertial=replace(data.inertial, gyro=gyro))
+
+
+GYROSCOPE = InputParameter(
+    "imu.gyroscope",
+    XYZ,
+    "",
+    np.full(3, 1e-3),
+    frozenset({"imu", "gnss", "velocity"}),
+    _response_moved,
+)
+"""What the gyroscope reads too much along its axes, per turn of the vehicle about its vertical: by
+its scale, and by axes that are not those of the accelerometer. A vehicle turns about nothing else
+for long."""
+
+
 def speed_scale(data: SmootherInput) -> InputParameter:
     """The scale of the velocities of an input."""
     return SPEED_SCALE if data.wheels is None else WHEEL_SCALE

@@ -24,6 +24,7 @@ from caliv_graph.trajectory.marginals import node_ordering
 from caliv_graph.trajectory.parameters import (
     AXLE_SLIP,
     GNSS_TIME_OFFSET,
+    GYROSCOPE,
     HEADING_YAW,
     IMU_PLACE,
     IMU_ROTATION,
@@ -119,6 +120,9 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
     place = data.config.imu.place_sigma()
     if place is not None and data.wheels is None and _has_place(data):
         out.append(UncertainParameter(IMU_PLACE, np.full(3, place), np.zeros(3)))
+    response = data.config.imu.gyroscope_sigma
+    if response and data.wheels is None:
+        out.append(UncertainParameter(GYROSCOPE, np.full(3, response), np.zeros(3)))
     out += _clocks(data)
     wheels = data.config.wheels
     if data.wheels is not None:

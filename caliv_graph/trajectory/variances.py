@@ -31,10 +31,12 @@ from caliv_graph.trajectory.correlated import (
     add_prior,
     linearised,
 )
+from caliv_graph.trajectory.imu import bridged_s
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.parameters import (
     AXLE_SLIP,
     GNSS_TIME_OFFSET,
+    GYROSCOPE,
     HEADING_YAW,
     LEAN,
     LEVER_ARM,
@@ -138,15 +140,19 @@ def estimated_scales(
     typed = [rotation] if data.positions is None else [LEVER_ARM, rotation, GNSS_TIME_OFFSET]
     if data.motion.twist is not None and data.speed_scale_sigma:
         typed.append(speed_scale(data))
+    typed += [GYROSCOPE] if data.config.imu.gyroscope_sigma and data.wheels is None else []
     typed += [SPEED_POINT] if data.speed_alone else []
     if data.wheels is not None:
         typed += [LEAN, AXLE_SLIP] if data.wheels.planar else [LEAN]
     typed += [HEADING_YAW] if data.headings is not None else []
     typed += [SECOND_ARM] if data.baselines is not None else []
     columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)
+    bridged = iter(bridged_s(data.inertial, nodes) > 0.0)
+    # What happens in a gap is no noise of the IMU.
+    kinds = ["gap" if kind == "imu" and next(bridged) else kind for kind in graph.kinds]
     likelihood = NoiseLikelihood(
         graph.factors.linearize(values),
-        graph.kinds,
+        kinds,
         [key_yaw_bias()] if data.yaw_bias else [],
         nodes,
         part.R_map_imu,

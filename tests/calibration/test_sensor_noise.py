@@ -115,6 +115,31 @@ def test_an_error_of_the_fixes_that_is_correlated_over_time_is_found() -> None:
     assert names["gnss_correlated_horizontal"].time_s == error.time_s
 
 
+def test_an_error_of_the_heading_is_none_of_roll_and_pitch() -> None:
+    """An INS has its heading from elsewhere. A tilt that errs as fast takes up the gyroscope."""
+    true = CorrelatedError("orientation", (1e-4, 1e-4, 3e-3), 10.0)
+    made = evidence(2, 5e-3, None)
+    ((columns, effects),) = made.effects
+    shifted_by = effects["gnss"].gain.reshape(POSES, 6, 3, STEPS)
+    turned = np.roll(shifted_by, 3, axis=1).reshape(6 * POSES, 3, STEPS)
+    made = replace(made, effects=[(columns, {"orientation": ErrorEffects("", STAMPS, turned)})])
+    rng = np.random.default_rng(4)
+    moved = np.hstack([s * made.by_pose @ turned[:, a] for a, s in enumerate(true.sigmas)])
+    swing = np.exp(-np.abs(STAMPS[:, None] - STAMPS) * 1e-9 / true.time_s)
+    error = (np.linalg.cholesky(swing) @ rng.standard_normal((STEPS, 3))).T.ravel()
+    seen = replace(made.observed, residuals=made.observed.residuals + moved @ error)
+
+    (found,) = estimated(replace(made, observed=seen), NoiseConfig()).correlated
+
+    assert found.kind == "orientation"
+    assert found.sigmas[2] == pytest.approx(true.sigmas[2], rel=0.7)
+    assert found.sigmas[0] < 0.2 * found.sigmas[2]
+    levels = estimated(replace(made, observed=seen), NoiseConfig()).levels
+    sizes = {level.name: level.sigma for level in levels}
+    assert sizes["orientation_correlated_yaw"] == found.sigmas[2]
+    assert sizes["orientation_correlated_tilt"] == found.sigmas[0]
+
+
 def test_the_slope_of_all_levels_and_factors_of_clouds_is_right() -> None:
     made, names = evidence(0, 5e-3, None), ["heave", "registration"]
     rng = np.random.default_rng(1)

@@ -195,7 +195,7 @@ def first_fix_map(motion: MotionData) -> Array:
 
 
 def config_for(sensors: Sensors, **sections: Mapping[str, object]) -> Config:
-    """A config that knows extrinsics and clocks exactly, unless `sections` say otherwise."""
+    """A config that knows extrinsics, clocks and gyroscope exactly, but for what `sections` say."""
     rpy = np.degrees(sensors.T_vehicle_imu.rotation().rpy())
     known: dict[str, object] = {} if not any(sensors.lever_arm) else {"lever_arm_sigma": 1e-7}
     same = sensors.T_vehicle_imu.equals(gtsam.Pose3(), 1e-9)
@@ -210,6 +210,7 @@ def config_for(sensors: Sensors, **sections: Mapping[str, object]) -> Config:
     raw["wheels"] = {**clock, **sections.get("wheels", {})}
     raw["imu"] = {
         **clock,
+        "gyroscope_sigma": 0.0,
         "T_vehicle_imu": {
             "xyz": sensors.T_vehicle_imu.translation().tolist(),
             "rpy_deg": rpy.tolist(),

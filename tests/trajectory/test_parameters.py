@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from caliv_graph.config.model import Config
-from caliv_graph.products import Array, GnssFixes, ImuSamples
+from caliv_graph.products import Array, GnssFixes, ImuSamples, MotionData
 from caliv_graph.trajectory.columns import whitening
 from caliv_graph.trajectory.parameters import (
     GNSS_TIME_OFFSET,
+    GYROSCOPE,
     IMU_PLACE,
     IMU_ROTATION,
     IMU_TIME_OFFSET,
@@ -45,6 +46,8 @@ def smoothed_with(parameter: InputParameter, d: Array) -> SmoothedTrajectory:
     if parameter is IMU_TIME_OFFSET:
         assert MOTION.imu is not None
         return smooth_trajectory(replace(MOTION, imu=earlier(MOTION.imu, d)), CONFIG, WANTED)
+    if parameter is GYROSCOPE:
+        return smooth_trajectory(with_response(MOTION, -d), CONFIG, WANTED)
     if parameter is LEVER_ARM:
         arm = np.array(CONFIG.gnss.lever_arm) + d
         return smooth_trajectory(MOTION, config_of({"gnss": {"lever_arm": tuple(arm)}}), WANTED)
@@ -53,6 +56,14 @@ def smoothed_with(parameter: InputParameter, d: Array) -> SmoothedTrajectory:
     rpy = gtsam.Rot3.Expmap(turn).compose(T.rotation()).rpy()
     mounting = {"xyz": tuple(T.translation() + shift), "rpy_deg": tuple(np.degrees(rpy))}
     return smooth_trajectory(MOTION, config_of({"imu": {"T_vehicle_imu": mounting}}), WANTED)
+
+
+def with_response(motion: MotionData, d: Array) -> MotionData:
+    """The drive by a gyroscope that reads d more per turn about the vehicle's vertical."""
+    assert motion.imu is not None
+    gyro = motion.imu.angular_velocity
+    up = SENSORS.T_vehicle_imu.rotation().matrix()[2]
+    return replace(motion, imu=replace(motion.imu, angular_velocity=gyro + np.outer(gyro @ up, d)))
 
 
 def earlier(samples: Samples, d: Array) -> Samples:
@@ -91,8 +102,9 @@ def test_derivatives_are_whitened_as_the_residuals_are() -> None:
         (IMU_PLACE, np.array([0.02, -0.01, 0.03])),
         (GNSS_TIME_OFFSET, np.array([3e-3])),
         (IMU_TIME_OFFSET, np.array([-2e-4])),
+        (GYROSCOPE, np.array([3e-3, -2e-3, 4e-3])),
     ],
-    ids=["lever arm", "imu rotation", "imu place", "gnss clock", "imu clock"],
+    ids=["lever arm", "imu rotation", "imu place", "gnss clock", "imu clock", "gyroscope"],
 )
 def test_the_joint_gaussian_predicts_what_a_moved_parameter_does(
     parameter: InputParameter, d: Array

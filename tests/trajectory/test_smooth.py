@@ -471,6 +471,8 @@ def test_a_gap_in_the_imu_is_bridged_and_the_covariance_says_so() -> None:
     assert nees.mean() < 12.0
     assert nees[at - 3 : at + 4].max() < 40.0
     assert "1 gap(s) in the IMU" in smoothed.warnings[0]
+    # The IMU is no better because the vehicle turned less in the gap than it may.
+    assert smoothed.data.scales == {}
 
 
 def test_a_yaw_bias_is_found_where_it_is_asked_for() -> None:

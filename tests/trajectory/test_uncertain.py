@@ -94,6 +94,33 @@ def test_what_was_measured_roughly_is_in_the_covariance_of_every_pose() -> None:
     assert nees(motion, rough) < 12.0
 
 
+def test_the_scale_and_the_axes_of_a_gyroscope_are_estimated() -> None:
+    """4 mrad per radian: in a figure-eight the heading is 20 mrad off, and comes back."""
+    sensors = replace(SENSORS, noise=0.1)
+    motion = record(COURSE, sensors, 3)
+    imu = motion.imu
+    assert imu is not None
+    up = sensors.T_vehicle_imu.rotation().matrix()[2]
+    response = np.array([1e-3, -2e-3, 4e-3])
+    gyro = imu.angular_velocity + np.outer(imu.angular_velocity @ up, response)
+    motion = replace(motion, imu=replace(imu, angular_velocity=gyro))
+    usual = config_for(sensors, imu={"gyroscope_sigma": 2e-3})
+
+    smoothed = smooth_trajectory(motion, usual, WANTED)
+
+    (found,) = (p for p in smoothed.parameters if p.parameter.name == "imu.gyroscope")
+    sigma = smoothed.sigmas_of("imu.gyroscope")
+    assert sigma is not None
+    assert found.offset is not None
+    assert sigma.max() < 4e-4
+    assert np.abs((found.offset - response) / sigma).max() < 3.5
+    assert nees(motion, smoothed) < 12.0
+    # A tenth of the usual noise. Held, the scale would be taken for eight times as much.
+    exact = smooth_trajectory(motion, config_for(sensors), WANTED)
+    assert smoothed.data.scales["gyroscope"] < 0.15
+    assert exact.data.scales["gyroscope"] > 0.5
+
+
 @pytest.mark.parametrize(("late_s", "sigma_s"), [(0.0, 1e-4), (0.08, 0.02)])
 def test_motion_data_free_a_clock_that_is_clearly_late(late_s: float, sigma_s: float) -> None:
     motion = record(COURSE, SENSORS, 3)

@@ -31,6 +31,9 @@ LEVER_ARM_SIGMA_M = 0.01
 CORRELATED_M = 0.02
 """1 sigma of the Gauss-Markov error of the fixes, per axis."""
 
+GOOD = 0.1
+"""Noise of a gyroscope of which a scale that is off can be told, over the nominal one."""
+
 CORRELATED_RAD = 2e-3
 """1 sigma of the Gauss-Markov error of the orientation, per axis: the slow error of a good AHRS."""
 
@@ -45,6 +48,7 @@ class Row:
         correlation_s: of GNSS errors of `CORRELATED_M`; 0: they are white.
         turning_s: correlation time of orientation errors of `CORRELATED_RAD`; 0: they are white.
         lever_arm: whether the config states a lever arm that is off by its sigma.
+        gyroscope: 1 sigma of the errors of the gyroscope's scale and axes.
     """
 
     text: str
@@ -56,6 +60,7 @@ class Row:
     correlation_s: float = 0.0
     turning_s: float = 0.0
     lever_arm: bool = False
+    gyroscope: float = 0.0
 
 
 ROWS: Mapping[str, Row] = {
@@ -73,6 +78,7 @@ ROWS: Mapping[str, Row] = {
     "gnss_10s": Row("GNSS error of 20 mm correlated over 10 s", correlation_s=10.0),
     "gnss_60s": Row("GNSS error of 20 mm correlated over 60 s", correlation_s=60.0),
     "lever_arm": Row("lever arm off by 10 mm per axis, 1 sigma", lever_arm=True),
+    "gyroscope": Row("gyroscope of a tenth of the noise, its scale off by 4e-3", gyroscope=4e-3),
     "orientation_30s": Row("orientation error of 2 mrad correlated over 30 s", turning_s=30.0),
 }
 """By name."""
@@ -113,7 +119,9 @@ def scenario_of(task: Task) -> Scenario:
             "imu": imu.model_copy(
                 update={
                     "accelerometer_sigma_m_s2": row.imu * imu.accelerometer_sigma_m_s2,
-                    "gyroscope_sigma_rad_s": row.imu * imu.gyroscope_sigma_rad_s,
+                    "gyroscope_sigma_rad_s": (GOOD if row.gyroscope else row.imu)
+                    * imu.gyroscope_sigma_rad_s,
+                    "gyroscope_scale_sigma": row.gyroscope,
                     "stated_over_true": 1.0 / row.imu,
                     "orientation": imu.orientation.model_copy(
                         update={

@@ -88,7 +88,7 @@ class ImuConfig(Section):
         description="degrees, sigma of the rotation of T_vehicle_imu about each vehicle axis; "
         "absent: 0.1, and none where T_vehicle_imu is absent or the identity",
     )
-    gyroscope_sigma: NonNegative = Field(
+    gyroscope_scale_sigma: NonNegative = Field(
         2e-3,
         description="radians per radian, sigma of the error of its gyroscope's scale, and of the "
         "directions of its axes; 0: exact",

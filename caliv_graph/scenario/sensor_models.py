@@ -266,6 +266,11 @@ class ImuModel(_SampledSection):
     gyroscope_bias_walk_rad_s2_sqrthz: NonNegative = Field(
         0.0, description="rad/s per sqrt(second), random walk of the bias"
     )
+    gyroscope_scale_sigma: NonNegative = Field(
+        0.0,
+        description="radians per radian, 1 sigma of the errors of its scale, and of the directions "
+        "of its axes, of each axis on a drive",
+    )
     stated_over_true: Positive = Field(
         1.0,
         description="sigmas that the messages state for acceleration and rate, over the true ones",

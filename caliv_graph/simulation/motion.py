@@ -110,6 +110,8 @@ def simulate_imu(drive: Drive, scenario: Scenario, seed: int) -> SimulatedImu:
         dt_s,
         draws[:, 3:],
     )
+    off = random_stream(seed, Stream.GYROSCOPE_SCALE).standard_normal((3, 3))
+    turned_by = rate + model.gyroscope_scale_sigma * rate @ off
     orientation = model.orientation
     xyzw = None
     if orientation.enabled:
@@ -126,7 +128,7 @@ def simulate_imu(drive: Drive, scenario: Scenario, seed: int) -> SimulatedImu:
     known = scenario.bag.covariances == "stated"
     samples = ImuSamples(
         stamps_ns=_absolute(stamps_ns, scenario),
-        angular_velocity=rate + gyroscope_bias + model.gyroscope_sigma_rad_s * noise[:, :3],
+        angular_velocity=turned_by + gyroscope_bias + model.gyroscope_sigma_rad_s * noise[:, :3],
         specific_force=force + accelerometer_bias + model.accelerometer_sigma_m_s2 * noise[:, 3:],
         orientation_xyzw=xyzw,
         orientation_cov=(

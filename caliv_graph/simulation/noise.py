@@ -43,6 +43,7 @@ class Stream(enum.IntEnum):
     RANGE_BIAS = 14
     TIME_JITTER = 15
     CHANNELS = 16
+    GYROSCOPE_SCALE = 17
 
 
 def random_stream(seed: int, stream: Stream, *index: int) -> np.random.Generator:

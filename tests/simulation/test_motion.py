@@ -311,6 +311,24 @@ def test_messages_state_the_covariance_of_the_noise_or_that_it_is_unknown() -> N
     np.testing.assert_array_equal(unknown.imu.specific_force, motion.imu.specific_force)
 
 
+def test_a_gyroscope_s_scale_and_axes_are_off_by_as_much_in_every_reading() -> None:
+    model = ImuModel(gyroscope_sigma_rad_s=0.0, gyroscope_scale_sigma=2e-3)
+    exact = ImuModel(gyroscope_sigma_rad_s=0.0)
+    responses = []
+    for seed in range(12):
+        read, true = (
+            imu_of(simulate_drive(scenario_of(imu=of), seed)).angular_velocity
+            for of in (model, exact)
+        )
+        # The vehicle turns about its vertical alone.
+        turning = np.abs(true[:, 2]) > 0.05
+        assert turning.any()
+        ratio = read[turning] / true[turning, 2:] - [0.0, 0.0, 1.0]
+        np.testing.assert_allclose(ratio, np.tile(ratio[:1], (len(ratio), 1)), atol=1e-9)
+        responses.append(ratio[0])
+    assert np.sqrt(np.mean(np.square(responses))) == pytest.approx(2e-3, rel=0.5)
+
+
 def test_bias_is_drawn_at_the_start_and_walks() -> None:
     imu = ImuModel(
         accelerometer_bias_sigma_m_s2=(0.1, 0.2, 0.4),

@@ -210,7 +210,7 @@ def config_for(sensors: Sensors, **sections: Mapping[str, object]) -> Config:
     raw["wheels"] = {**clock, **sections.get("wheels", {})}
     raw["imu"] = {
         **clock,
-        "gyroscope_sigma": 0.0,
+        "gyroscope_scale_sigma": 0.0,
         "T_vehicle_imu": {
             "xyz": sensors.T_vehicle_imu.translation().tolist(),
             "rpy_deg": rpy.tolist(),

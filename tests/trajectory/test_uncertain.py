@@ -104,7 +104,7 @@ def test_the_scale_and_the_axes_of_a_gyroscope_are_estimated() -> None:
     response = np.array([1e-3, -2e-3, 4e-3])
     gyro = imu.angular_velocity + np.outer(imu.angular_velocity @ up, response)
     motion = replace(motion, imu=replace(imu, angular_velocity=gyro))
-    usual = config_for(sensors, imu={"gyroscope_sigma": 2e-3})
+    usual = config_for(sensors, imu={"gyroscope_scale_sigma": 2e-3})
 
     smoothed = smooth_trajectory(motion, usual, WANTED)
 

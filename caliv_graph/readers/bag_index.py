@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,13 +38,31 @@ _STATIC_TOPIC = "/tf_static"
 
 
 @dataclass(frozen=True)
+class ScanTimes:
+    """When the clouds of a LiDAR were taken and recorded.
+
+    Attributes:
+        stamps_ns: (n,), ascending, each once.
+        records_ns: (n,) record time of each.
+    """
+
+    stamps_ns: IntArray
+    records_ns: IntArray
+
+    def records(self, wanted: Container[int] | None = None) -> dict[int, int]:
+        """Record time by stamp, in the order of the stamps; of all, or of those that are wanted."""
+        both = zip(self.stamps_ns.tolist(), self.records_ns.tolist(), strict=True)
+        return {stamp: record for stamp, record in both if wanted is None or stamp in wanted}
+
+
+@dataclass(frozen=True)
 class BagIndex:
     """The result of the first pass over a bag.
 
     Attributes:
         clocks: the stamps of each topic, summarised.
         frame_ids: the frame in the first header of each topic.
-        scans: record time by stamp of each LiDAR's clouds, in the order of the stamps.
+        scans: of each LiDAR's clouds.
         collectors: motion data by kind and topic, until they are taken.
         marks: what the stamps of each LiDAR mark.
         warnings: what is missing or damaged, a line each.
@@ -52,7 +70,7 @@ class BagIndex:
 
     clocks: Mapping[str, Clock]
     frame_ids: Mapping[str, str]
-    scans: Mapping[str, Mapping[int, int]]
+    scans: Mapping[str, ScanTimes]
     collectors: dict[tuple[str, str], Collector]
     marks: Mapping[str, StampMark]
     warnings: tuple[str, ...]
@@ -191,7 +209,7 @@ def _collector(kind: str, type_name: str) -> Collector:
     return COLLECTORS.get((kind, type_name), _COLLECTORS[kind])()
 
 
-def _by_stamp(header_ns: IntArray, record_ns: IntArray) -> dict[int, int]:
-    """Record time by stamp, in the order of the stamps; of equal stamps the first recorded."""
+def _by_stamp(header_ns: IntArray, record_ns: IntArray) -> ScanTimes:
+    """The clouds in the order of their stamps; of equal stamps the first recorded."""
     stamps, first = np.unique(effective_stamps(header_ns, record_ns), return_index=True)
-    return dict(zip(stamps.tolist(), record_ns[first].tolist(), strict=True))
+    return ScanTimes(stamps, record_ns[first])

@@ -171,7 +171,8 @@ class RosbagRecording:
         Raises:
             RecordingError: the bag is damaged.
         """
-        return list(self._index.scans[lidar])
+        stamps: list[int] = self._index.scans[lidar].stamps_ns.tolist()
+        return stamps
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         """The clouds of one LiDAR in the order of their stamps, a few decoded ahead (`Recording`).
@@ -182,11 +183,7 @@ class RosbagRecording:
             RecordingError: the bag is damaged, or the clouds have no x, y, z.
         """
         topic = self._topics[lidar].name
-        records_ns = {
-            stamp_ns: record_ns
-            for stamp_ns, record_ns in self._index.scans[lidar].items()
-            if wanted is None or stamp_ns in wanted
-        }
+        records_ns = self._index.scans[lidar].records(wanted)
         clouds = wanted_clouds(self._bag, topic, records_ns)
         found = ((lidar, stamp_ns, raw) for stamp_ns, raw in clouds)
         for decoded in worked_ahead(self._decoded, found):
@@ -264,9 +261,9 @@ class RosbagRecording:
         if self._poses is not None:
             found["pose"] = read_poses(self._poses)
             # Record times are of the recorder's clock, poses of that of the stamps.
-            stamps = [stamp_ns for scans in index.scans.values() for stamp_ns in scans]
+            stamps = [scans.stamps_ns for scans in index.scans.values() if len(scans.stamps_ns)]
             if stamps:
-                span_ns = min(stamps), max(stamps)
+                span_ns = int(min(s[0] for s in stamps)), int(max(s[-1] for s in stamps))
                 check_overlap(found["pose"], self._poses, span_ns, self._bag.name)
         if found.get("pose") is not None:
             found["pose"] = in_vehicle_axes(found["pose"], self._pose_axes)

@@ -36,7 +36,7 @@ from caliv_graph.structure.rows import PLACE_PRIOR_M, TILT_PRIOR_RAD, Rows, whit
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.solve import GATES_M, Solved
 from caliv_graph.structure.strips import Strips, find_strips
-from caliv_graph.structure.thickness import plane_rows, thickness_m, weighted_alike
+from caliv_graph.structure.thickness import thickness_m, weighted_alike
 
 OWN_SIGHTINGS = 3
 """Fewest sightings of a strip with which a LiDAR's distance is measured."""
@@ -325,7 +325,7 @@ def _measured(
     same = alike(problem, sightings)
     rows = whitened(geometry, sightings, group, repeated, same, other.nuisances, weights, layout)
     found = _Distances(other, rows)
-    offsets, by_plane = geometry.offsets_m(sightings), plane_rows(geometry, sightings)
+    offsets, by_plane = geometry.offsets_m(sightings), geometry.plane_rows(sightings)
     thickness = thickness_m(by_plane, sightings, weights, offsets, strips.count)
     if propagated is None or draws is None:
         return Measured(found.distances_m, None, thickness, None)

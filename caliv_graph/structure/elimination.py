@@ -106,6 +106,8 @@ def eliminated(
         rest: number of coordinates that remain.
         blocks: the others, block by block.
 
+    It lets go of H and V when it has what it needs of them.
+
     Raises:
         SolveError: a block is singular.
     """
@@ -113,6 +115,7 @@ def eliminated(
     out = (H[:rest, :rest] - V_rest @ V_rest.T).toarray()
     order = np.concatenate(blocks) if len(blocks) else np.zeros(0, dtype=np.int64)
     rows, V_own, V_columns = H[order], V[order], V_rest.T.tocsr()
+    del H, V, V_rest
     ends = np.cumsum([len(own) for own in blocks])
 
     def factored(k: int) -> _Block:

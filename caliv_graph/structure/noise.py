@@ -172,7 +172,7 @@ def _variances(sightings: Sightings, sigma_m: Array) -> Array:
 
 def fitted_noise(
     geometry: Geometry,
-    before: Geometry,
+    seen: Array,
     sightings: Sightings,
     group: IntArray,
     lidar: IntArray,
@@ -191,8 +191,7 @@ def fitted_noise(
 
     Args:
         geometry: residuals at the estimate.
-        before: where the system was linearised. Of derivatives elsewhere a part is in directions
-            that it does not determine, such as a turn of everything about a standing vehicle.
+        seen: (D, PROBES) `seen_signs` of the system that was solved.
         sightings: Q of them.
         group: (Q,) a number for scan and surface of each.
         lidar: (Q,) index of the LiDAR of each.
@@ -208,8 +207,6 @@ def fitted_noise(
         tilts: whether errors of tilts have sizes of their own; else those of offsets.
     """
     offsets = geometry.offsets_m(sightings)
-    sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)
-    seen = _seen_signs(before, sightings, weights, layout, sigma)
     asked = _Asked.of(solve, layout, seen)
     fitted = float((seen * asked.of_offsets).sum() / PROBES / max(weights.sum(), 1.0))
     free = 1.0 - min(fitted, MOST_FITTED)
@@ -254,15 +251,23 @@ def fitted_noise(
     )
 
 
-def _seen_signs(
-    geometry: Geometry, sightings: Sightings, weights: Array, layout: Layout, sigma: Array
+def seen_signs(
+    geometry: Geometry,
+    sightings: Sightings,
+    weights: Array,
+    layout: Layout,
+    nuisances: Nuisances,
 ) -> Array:
     """(D, PROBES) `J^T W^1/2` times random signs, by which `tr(J H^-1 J^T W)` is estimated.
+
+    `geometry` is where the system was linearised. Of derivatives elsewhere a part is in directions
+    that it does not determine, such as a turn of everything about a standing vehicle.
 
     That over `sum(w)` is the share of the offsets' variance that the estimate takes up. W is that
     of the system: an outlier without weight says nothing. By random signs (Hutchinson): the exact
     trace costs as much as all else together.
     """
+    sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)
     J = geometry.offset_rows(sightings, layout.size)
     root = np.sqrt(weights / _variances(sightings, sigma))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (sightings.count, PROBES))
@@ -274,7 +279,7 @@ class _Asked:
     """What noise levels are fitted by: H^-1 times some columns.
 
     Attributes:
-        of_offsets: (D, PROBES) those of `_seen_signs`.
+        of_offsets: (D, PROBES) those of `seen_signs`.
         of_biases: (n, n) block of H^-1 of the biases of the LiDARs' ranges.
         of_signs: first coordinate of some errors -> random signs (n, PROBES) on them, and H^-1
             times these, there.

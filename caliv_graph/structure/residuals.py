@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -52,6 +52,10 @@ class Geometry:
     def offsets_m(self, sightings: Sightings) -> Array:
         """(Q,) distance of the middle of each sighting from its plane."""
         return np.asarray(np.einsum("qi,qi->q", self.plain, _middles(sightings)))
+
+    def plane_rows(self, sightings: Sightings) -> Array:
+        """(Q, 3) derivatives of `offsets_m` by the planes."""
+        return np.asarray(np.einsum("qci,qi->qc", self.by[:, PLANE_ROWS], _middles(sightings)))
 
     def offset_rows(self, sightings: Sightings, size: int) -> scipy.sparse.csr_array:
         """(Q, `size`) derivatives of `offsets_m`."""
@@ -246,11 +250,13 @@ def geometry_of(
         own = layout.turn + 3 * turn[:, None] + np.arange(3)
         by_turn_rate = sightings.time_s[:, None, None] * by_pose[:, :3]
         moved.append((by_turn_rate, own, state.errors[own]))
-    beams = sightings.beams
+    beams, of_beams_by = sightings.beams, slice(0)
     if beams is not None:
         beams = beams.turned(by_extrinsic[:, 2])
         own = layout.beam + beams.column
         of_beams += np.einsum("qc,qci->qi", state.errors[own], beams.by)
+        begin = sum(part.shape[1] for part in parts)
+        of_beams_by = slice(begin, begin + own.shape[1])
         parts.append(beams.by)
         columns.append(own)
     if layout.bent:
@@ -262,6 +268,9 @@ def geometry_of(
         parts.append(by)
         columns.append(own)
     by, column = np.concatenate(parts, axis=1), np.concatenate(columns, axis=1)
+    if beams is not None:
+        # No second copy: of many channels it is half of all.
+        beams = replace(beams, by=by[:, of_beams_by])
     return Geometry(plain + of_beams, plain, by, column, m, beams)
 
 

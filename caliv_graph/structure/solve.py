@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 
 import gtsam
@@ -23,6 +23,7 @@ from caliv_graph.structure.noise import (
     fitted_noise,
     range_sigmas,
     robust_weights,
+    seen_signs,
     tilt_weights,
 )
 from caliv_graph.structure.problem import (
@@ -38,7 +39,7 @@ from caliv_graph.structure.problem import (
     with_hold,
 )
 from caliv_graph.structure.residuals import Geometry
-from caliv_graph.structure.rows import whitened
+from caliv_graph.structure.rows import Rows, whitened
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.standing import Stands, stands_of
 from caliv_graph.structure.strips import Strips, find_strips
@@ -74,7 +75,10 @@ Clocks = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimate of a drive, its strips, and the noise at which it is to be linearised."""
+    """An estimate of a drive, its strips, and the noise at which it is to be linearised.
+
+    It is without the residuals, which take 70 MB and more: nobody keeps two.
+    """
 
     problem: Problem
     state: State
@@ -83,32 +87,7 @@ class Estimate:
     weights: Array
     nuisances: Nuisances
     layout: Layout
-    geometry: Geometry
     converged: bool
-
-    def linearised(self) -> System:
-        """The linearised system there. It takes most of the memory: nobody keeps two."""
-        problem, sightings = self.problem, self.sightings
-        group = groups_of(sightings, self.strips)
-        repeated = problem.views.count[sightings.scan]
-        return system_of(  # it lets go of the rows, which nobody else may hold
-            whitened(
-                self.geometry,
-                sightings,
-                group,
-                repeated,
-                alike(problem, sightings),
-                self.nuisances,
-                self.weights,
-                self.layout,
-            ),
-            self.state,
-            self.layout,
-            problem.prior,
-            self.nuisances,
-            problem.standing,
-            self.stands(),
-        )
 
     def levels(self) -> Levels:
         """Its noise levels, for the strips of another round."""
@@ -135,10 +114,40 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Sighted(Estimate):
+    """An estimate with its residuals."""
+
+    geometry: Geometry
+
+    def rows(self) -> Rows:
+        """The residuals in units of their noise."""
+        problem, sightings = self.problem, self.sightings
+        return whitened(
+            self.geometry,
+            sightings,
+            groups_of(sightings, self.strips),
+            problem.views.count[sightings.scan],
+            alike(problem, sightings),
+            self.nuisances,
+            self.weights,
+            self.layout,
+        )
+
+
+@dataclass(frozen=True)
 class Solved(Estimate):
-    """The outcome: an estimate, the system there, and what it tells of clocks that are held."""
+    """The outcome: an estimate, the system there, and what it tells of clocks that are held.
+
+    Attributes:
+        system: the linearised system.
+        offsets_m: (Q,) `Geometry.offsets_m`.
+        plane_rows: (Q, 3) `Geometry.plane_rows`.
+        clocks: of LiDARs whose clocks are held.
+    """
 
     system: System
+    offsets_m: Array
+    plane_rows: Array
     clocks: Clocks = field(default_factory=dict)
 
     @cached_property
@@ -146,6 +155,44 @@ class Solved(Estimate):
         """Of its information with what holds the extrinsics (`elimination.factor_of`)."""
         H, _ = with_hold(self.problem, self.state, self.system)
         return factor_of(H)
+
+
+def with_residuals(found: Estimate, dents: bool = True) -> Sighted:
+    """An estimate with its residuals; `dents` as in `residuals.geometry_of`."""
+    geometry = geometry_at(found.problem, found.state, found.sightings, found.layout, dents)
+    return Sighted(**vars(without_residuals(found)), geometry=geometry)
+
+
+def without_residuals(found: Estimate) -> Estimate:
+    """An estimate without its residuals."""
+    return Estimate(**{each.name: getattr(found, each.name) for each in fields(Estimate)})
+
+
+def _linearised(held: list[Sighted]) -> System:
+    """The linearised system at the estimate in `held`, which is taken out.
+
+    It takes most of the memory: nobody keeps two, and residuals are let go of when its rows are
+    there.
+    """
+    before = held.pop()
+    rows, found = [before.rows()], without_residuals(before)
+    del before
+    return system_of(  # it lets go of the rows, which nobody else may hold
+        rows.pop(),
+        found.state,
+        found.layout,
+        found.problem.prior,
+        found.nuisances,
+        found.problem.standing,
+        found.stands(),
+    )
+
+
+def _with_gradient(found: Sighted) -> tuple[Estimate, Array]:
+    """An estimate without its residuals, and the gradient (R,) of its system."""
+    estimate, held = without_residuals(found), [found]
+    del found
+    return estimate, _linearised(held).b
 
 
 @dataclass(frozen=True)
@@ -204,19 +251,25 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         found = _round(own, state, range_sigma, gate, levels)
         if found is None:
             return None
-        found = _settled(found, steps)
+        found = without_residuals(_settled(found, steps))
         levels, state = found.levels(), found.state
     if found is None:
         return None
-    gradient, clocks = None, Clocks()
-    if own.twists is not None:
+    clocks = Clocks()
+    if own.twists is None:
+        found, gradient = _with_gradient(with_residuals(found))
+    else:
         jittering, system, clocks = _with_jitter(found)
-        if jittering is None:
-            gradient = system.b[: found.layout.plane]
-        else:
-            found = _settled(jittering, LAST_STEPS, system)
+        gradient = system.b[: found.layout.plane]
+        systems = [system]
         del system
-    return replace(_on_all_poses(found, problem, poses, gradient), clocks=clocks)
+        if jittering is not None:
+            found, gradient = _with_gradient(_settled(jittering, LAST_STEPS, systems))
+        systems.clear()
+    # Handed over, as its prior on the poses with scans is not needed beside that on all.
+    held = [found]
+    del own, found
+    return replace(_on_all_poses(held, problem, poses, gradient), clocks=clocks)
 
 
 def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
@@ -233,9 +286,8 @@ def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved 
     found = _round(problem, state, range_sigma, GATES_M[0], levels)
     if found is None:
         return None
-    return _on_all_poses(
-        _settled(found, STEPS[0]), problem, np.arange(len(problem.prior.stamps_ns))
-    )
+    found, gradient = _with_gradient(_settled(found, STEPS[0]))
+    return _on_all_poses([found], problem, np.arange(len(problem.prior.stamps_ns)), gradient)
 
 
 def _rough(
@@ -254,7 +306,7 @@ def _rough(
         found = _round(some, rough, range_sigma, gate, levels)
         if found is None:
             break
-        found = _settled(found, steps=2, tilts=False)
+        found = without_residuals(_settled(found, steps=2, tilts=False))
         levels = replace(found.levels(), beams=None, bend_per_m=levels.bend_per_m)
         rough, beam = found.state, found.layout.beam
     if len(rough.errors):
@@ -273,10 +325,9 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks]:
     layout = replace(found.layout, jitters=scans)
     errors = np.insert(found.state.errors, np.full(scans, first), 0.0)
     state = replace(found.state, errors=errors)
-    geometry = geometry_at(problem, state, found.sightings, layout)
-    jittering = replace(found, state=state, layout=layout, geometry=geometry)
+    jittering = replace(found, state=state, layout=layout)
     give_back_freed_memory()
-    system = jittering.linearised()
+    system = _linearised([with_residuals(jittering)])
     give_back_freed_memory()
     # The hold in place, and out again: a copy would be as large as the system.
     held = slice(layout.offset, layout.error)
@@ -298,23 +349,26 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks]:
 
 
 def _on_all_poses(
-    found: Estimate, problem: Problem, poses: IntArray, gradient: Array | None = None
+    held: list[Estimate], problem: Problem, poses: IntArray, gradient: Array
 ) -> Solved:
-    """The same estimate with all poses of a drive, of which it has some (p,).
+    """The estimate in `held`, taken out, with all poses of a drive, of which it has some (p,).
 
     Its information is without what dents of the ground tell. The steps use them: derivatives that
-    are not those of the residuals do not lead to the estimate. `gradient` is with them, where it is
-    known.
+    are not those of the residuals do not lead to the estimate. `gradient` is with them.
     """
-    if gradient is None:
-        gradient = found.linearised().b
+    found = held.pop()
     b = on_all_coordinates(gradient, problem.prior, poses)
     state = on_all_poses(problem.prior, poses, found.state)
     layout = replace(found.layout, poses=len(problem.prior.stamps_ns))
-    geometry = geometry_at(problem, state, found.sightings, layout, dents=False)
-    found = replace(found, problem=problem, state=state, layout=layout, geometry=geometry)
+    found = replace(found, problem=problem, state=state, layout=layout)
     give_back_freed_memory()
-    return Solved(**vars(found), system=replace(found.linearised(), b=b))
+    sighted = with_residuals(found, dents=False)
+    offsets_m = sighted.geometry.offsets_m(found.sightings)
+    plane_rows = sighted.geometry.plane_rows(found.sightings)
+    handed = [sighted]
+    del sighted
+    system = replace(_linearised(handed), b=b)
+    return Solved(**vars(found), system=system, offsets_m=offsets_m, plane_rows=plane_rows)
 
 
 def linearised(
@@ -336,8 +390,10 @@ def linearised(
     """
     state = first_state(problem, T_vehicle_lidar)
     found = _round(problem, state, range_sigma_m, GATES_M[-1], levels)
-    every = np.arange(len(problem.prior.stamps_ns))
-    return None if found is None else _on_all_poses(found, problem, every)
+    if found is None:
+        return None
+    found, gradient = _with_gradient(with_residuals(found))
+    return _on_all_poses([found], problem, np.arange(len(problem.prior.stamps_ns)), gradient)
 
 
 def _round(
@@ -381,37 +437,44 @@ def _round(
         turn_rad_s=problem.turn_rad_s,
     )
     weights = np.ones(sightings.count)
-    geometry = geometry_at(problem, state, sightings, layout)
-    return Estimate(
-        problem, state, strips, sightings, weights, nuisances, layout, geometry, converged=False
-    )
+    return Estimate(problem, state, strips, sightings, weights, nuisances, layout, converged=False)
 
 
 def _settled(
-    found: Estimate, steps: int, first: System | None = None, tilts: bool = True
-) -> Estimate:
+    found: Estimate, steps: int, systems: list[System] | None = None, tilts: bool = True
+) -> Sighted:
     """Gauss-Newton steps; after each one the noise levels and the robust weights.
 
-    `first` is the system of the first step, where there is one.
+    The system of the first step is taken out of `systems`, where it is there.
     """
+    held = [with_residuals(found)]
     for number in range(steps):
-        found, size = _stepped(found, first if number == 0 else None, tilts)
+        # New strips, and each step, leave behind in pieces what the next one would come on top of.
+        give_back_freed_memory()
+        size = _step(held, systems or [], tilts)
         if number > 0 and size < SMALL_SIGMAS:
-            return replace(found, converged=True)
-    return replace(found, converged=False)
+            return replace(held.pop(), converged=True)
+    return replace(held.pop(), converged=False)
 
 
-def _stepped(found: Estimate, system: System | None, tilts: bool) -> tuple[Estimate, float]:
-    """The estimate after a step, and the size of the step in sigmas of the extrinsics."""
+def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
+    """Puts the estimate after a step in the place of the one in `held`.
+
+    Returns the size of the step in sigmas of the extrinsics. The system is taken out of `systems`,
+    where it is there.
+    """
+    found = without_residuals(held[0])
     problem, layout, sightings = found.problem, found.layout, found.sightings
-    system = system or found.linearised()
+    seen = seen_signs(held[0].geometry, sightings, found.weights, layout, found.nuisances)
+    system = systems.pop() if systems else _linearised(held)
+    held.clear()
     factor, b = _factor(found, system)
     d = system.surfaces.follow(solved(factor, b))
-    state = stepped(found.state, layout, d)
-    geometry = geometry_at(problem, state, sightings, layout)
+    after = with_residuals(replace(found, state=stepped(found.state, layout, d)))
+    geometry, state = after.geometry, after.state
     nuisances = fitted_noise(
         geometry,
-        found.geometry,
+        seen,
         sightings,
         groups_of(sightings, found.strips),
         problem.patches.scan_lidar[sightings.scan],
@@ -430,8 +493,8 @@ def _stepped(found: Estimate, system: System | None, tilts: bool) -> tuple[Estim
     weights = np.minimum(by_offset, tilt_weights(geometry, sightings, found.strips.level))
     step = d[layout.extrinsic : layout.error]
     cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
-    after = replace(found, state=state, weights=weights, nuisances=nuisances, geometry=geometry)
-    return after, math.sqrt(float(step @ np.linalg.solve(cov, step)))
+    held.append(replace(after, weights=weights, nuisances=nuisances))
+    return math.sqrt(float(step @ np.linalg.solve(cov, step)))
 
 
 def _factor(found: Estimate, system: System) -> tuple[tuple[Array, Array], Array]:

@@ -73,8 +73,11 @@ def system_of(
     if nuisances.jitter_s > 0.0:
         weight[layout.jitter : layout.plane] = nuisances.jitter_s**-2.0
     right -= weight * state.errors
-    sparse = (sparse + scipy.sparse.diags_array(weight)).tocsr()
-    H, b, surfaces = eliminated(sparse, less, right, layout.plane, layout.of_surfaces())
+    # Handed over: they are large, and only their parts are needed further on.
+    held = [less, (sparse + scipy.sparse.diags_array(weight)).tocsr()]
+    del sparse, less
+    blocks = layout.of_surfaces()
+    H, b, surfaces = eliminated(held.pop(), held.pop(), right, layout.plane, blocks)
     prior.add_to(H, b, state.moved)
     if layout.parameters:
         own = slice(6 * layout.poses, layout.rate)

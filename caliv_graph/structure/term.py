@@ -228,6 +228,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     are in the calibration's graph already.
     """
     layout, system, prior = found.layout, found.system, found.problem.prior
+    strips = strips_of(found)  # before the matrices below: it takes as much as they do
     poses = (6 * kept[:, None] + np.arange(6)).ravel()
     parameters = np.arange(6 * layout.poses, layout.rate)
     of_motion = np.concatenate([poses, parameters])
@@ -238,6 +239,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     stand = np.arange(layout.standing, layout.standing + STANDING)
     tilt = mean_tilt(found)
     of_tilt = np.zeros((0, len(system.H))) if tilt is None else tilt.rows
+    give_back_freed_memory()
     both, both_gradient, rows, cov = _marginal(
         system.H, system.b, np.concatenate([keep, stand]), of_tilt
     )
@@ -270,7 +272,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         T_vehicle_lidar=dict(zip(names, state.T_vehicle_lidar, strict=True)),
         information=information,
         gradient=gradient,
-        strips=strips_of(found),
+        strips=strips,
         offset_m=float(np.median(found.nuisances.sighting)),
         ground=lidars_with_ground(found),
         stance=stance,
@@ -381,7 +383,6 @@ def _to_perturbations(H: Array, b: Array, parameters: IntArray, by_now: Array) -
 def strips_of(found: Solved) -> tuple[Strip, ...]:
     """The strips at the estimate, for the report."""
     patches, strips, sightings = found.problem.patches, found.strips, found.sightings
-    offsets = found.geometry.offsets_m(sightings)
     lidar = patches.scan_lidar[sightings.scan]
     weight = found.weights * sightings.moments[:, 3, 3]
     out = []
@@ -393,7 +394,7 @@ def strips_of(found: Solved) -> tuple[Strip, ...]:
             total = float(weight[of_lidar].sum())
             if total > 0.0:
                 scans[name] = len(of_lidar)
-                residuals[name] = float(offsets[of_lidar] @ weight[of_lidar]) / total
+                residuals[name] = float(found.offsets_m[of_lidar] @ weight[of_lidar]) / total
         out.append(
             Strip(
                 drive=patches.drive,

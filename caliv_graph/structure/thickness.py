@@ -11,7 +11,6 @@ from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.noise import range_sigmas
 from caliv_graph.structure.problem import geometry_at, placed_patches, placed_sightings
-from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.solve import Solved
 
@@ -23,19 +22,13 @@ TOGETHER = 4096
 """Sightings whose derivatives are computed at a time: temporary memory is small."""
 
 
-def plane_rows(geometry: Geometry, sightings: Sightings) -> Array:
-    """(Q, 3) derivatives of the distances of the sightings' middles by their planes."""
-    middles = np.concatenate([sightings.centroids_lidar, np.ones((sightings.count, 1))], axis=1)
-    return np.asarray(np.einsum("qci,qi->qc", geometry.by[:, PLANE_ROWS], middles))
-
-
 def thickness_m(
     rows: Array, sightings: Sightings, weights: Array, offsets_m: Array, count: int
 ) -> Array:
     """(K, ...) root mean square distance of the sightings of each strip from a plane through them.
 
     Args:
-        rows: (Q, 3) `plane_rows`.
+        rows: (Q, 3) `Geometry.plane_rows`.
         sightings: Q of them.
         weights: (Q,) robust.
         offsets_m: (Q, ...) their distances from the plane at which `rows` were computed.
@@ -87,6 +80,8 @@ def thickness_at_guesses(found: Solved) -> Array:
         offsets_s=np.zeros_like(found.state.offsets_s),
         errors=np.zeros_like(found.state.errors),
     )
+    # All errors are zero: what those of beams and bends would do takes most of the memory.
+    problem = replace(problem, beam_nodes=(), bent=False)
     sigma = range_sigmas(problem.patches, problem.range_sigma_m)
     placed = placed_patches(problem, state)
     seen = placed_sightings(problem, placed, found.strips, sigma)
@@ -96,12 +91,11 @@ def thickness_at_guesses(found: Solved) -> Array:
         own = np.arange(begin, min(begin + TOGETHER, sightings.count))
         some = sightings.only(own)
         geometry = geometry_at(problem, state, some, found.layout)
-        rows[own], offsets[own] = plane_rows(geometry, some), geometry.offsets_m(some)
+        rows[own], offsets[own] = geometry.plane_rows(some), geometry.offsets_m(some)
     return thickness_m(rows, sightings, weights, offsets, found.strips.count)
 
 
 def thickness_at_estimate(found: Solved) -> Array:
     """(K,) of the strips of a solve."""
-    geometry, sightings = found.geometry, found.sightings
-    rows, offsets = plane_rows(geometry, sightings), geometry.offsets_m(sightings)
-    return thickness_m(rows, sightings, found.weights, offsets, found.strips.count)
+    count = found.strips.count
+    return thickness_m(found.plane_rows, found.sightings, found.weights, found.offsets_m, count)

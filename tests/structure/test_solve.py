@@ -1,8 +1,10 @@
 """The solve of structure with known truth, and what it determines."""
 
 import itertools
+import weakref
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -10,11 +12,15 @@ import pytest
 
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, StructureTerm
+from caliv_graph.structure import solve as solving
 from caliv_graph.structure import thickness
+from caliv_graph.structure.beams import beam_nodes
 from caliv_graph.structure.noise import ONE_VIEW_M, range_sigmas
-from caliv_graph.structure.problem import Problem, part_of
+from caliv_graph.structure.problem import Problem, geometry_at, part_of
+from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.solve import Solved, solve_structure
 from caliv_graph.structure.standing import Standing
+from caliv_graph.structure.system import System, system_of
 from caliv_graph.structure.term import term_of
 from caliv_graph.structure.thickness import thickness_at_guesses
 from caliv_graph.structure.views import Views
@@ -277,3 +283,37 @@ def test_strips_that_are_not_there_at_the_guesses_have_no_thickness_before(
     )
     assert np.isnan(thickness_at_guesses(none)).all()
     assert not np.isnan(thickness_at_guesses(solved)).all()
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 2e-3])
+def test_one_estimate_at_a_time_has_residuals_and_none_while_surfaces_are_eliminated(
+    monkeypatch: pytest.MonkeyPatch, jitter_s: float
+) -> None:
+    """Of a long drive residuals are as large as a system: peak memory is of one or the other."""
+    made: list[weakref.ref[Geometry]] = []
+    systems: list[weakref.ref[System]] = []
+
+    def geometry(*args: Any) -> Geometry:
+        assert not any(of() for of in made)
+        out = geometry_at(*args)
+        # No second copy of a half of the derivatives.
+        assert out.beams is None or np.shares_memory(out.beams.by, out.by)
+        made.append(weakref.ref(out))
+        return out
+
+    def system(*args: Any) -> System:
+        assert not any(of() for of in made)
+        assert not any(of() for of in systems)
+        out = system_of(*args)
+        systems.append(weakref.ref(out))
+        return out
+
+    problem = problem_of(yard(), figure_eight(12), 1, jitter_s=jitter_s)
+    problem = replace(problem, beam_nodes=beam_nodes(problem.patches))
+    monkeypatch.setattr(solving, "geometry_at", geometry)
+    monkeypatch.setattr(solving, "system_of", system)
+    found = solve(problem)
+    assert (found.nuisances.jitter_s > 0.0) == (jitter_s > 0.0)
+    assert not any(of() for of in made)
+    assert found.layout.beams
+    assert len(made) >= len(systems) > 8

@@ -73,6 +73,7 @@ def test_covariances_are_those_of_the_smoother(drive: DriveModel) -> None:
     recording = simulate_drive(scenario, 1)
     raw = config_of(recording, has_bag=True)
     raw["gnss"]["lever_arm_sigma"], raw["imu"]["rotation_sigma_deg"] = 1e-7, 1e-6  # known
+    raw["imu"]["gyroscope_scale_sigma"] = 0.0
     config = parse_config(raw, "config", Path())
     stamps = STAMPS + recording.truth.start_ns
     information, poses = smooth_trajectory(recording.motion(), config, stamps).joint_information(

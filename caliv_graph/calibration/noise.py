@@ -34,7 +34,7 @@ from caliv_graph.calibration.variance_components import (
     Likelihood,
     Observed,
     Unknown,
-    maximise,
+    maximise_exactly,
     time_of_expected,
 )
 from caliv_graph.calibration.vehicle_parameters import KEYS, POSE_TIME_OFFSET
@@ -184,7 +184,7 @@ def fit_pose_noise(
     sigmas = np.array(astuple(noise)[:4])
     poses = observed.covariance((*white, *slow(noise.drift_time_s)), np.log(sigmas))
     alike = Likelihood(replace(observed, known=poses), [Component(cloud, (0,)) for cloud in clouds])
-    (scale,), _ = maximise(alike.cost, [SCALE], np.array([TYPICAL_SCALE]), exactly=True)
+    (scale,), _ = maximise_exactly(alike.cost, [SCALE], np.array([TYPICAL_SCALE]))
     return noise, float(scale)
 
 
@@ -232,7 +232,7 @@ def expected_noise(
     for row, time in enumerate(times_s.tolist()):
         parts = [Component(part, (number,)) for number, part in enumerate((*white, *slow(time)))]
         likelihood = Likelihood(observed, [*parts, *of_clouds])
-        found, cost = maximise(likelihood.cost, unknowns, found, exactly=True)
+        found, cost = maximise_exactly(likelihood.cost, unknowns, found)
         surprise = math.log(time / TYPICAL.drift_time_s) / TIME_SPREAD
         costs[row], variances[row] = cost + 0.5 * surprise**2, found[:scale] ** 2
     weight = np.exp(costs.min() - costs)

@@ -154,7 +154,9 @@ def _estimate(
         told = structure.slow_errors(trajectories, start, extrinsics, config)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
-        problem = pose_problem(observations, trajectories, config, noise.heave_m, kept_ns=kept)
+        problem = pose_problem(
+            observations, trajectories, config, noise.heave_m, kept_ns=kept, floors=noise.floors
+        )
     times = {"registration": rough.registration_s}
 
     # Register again, from the solved graph: EM ends near where it starts, and the result shall
@@ -196,7 +198,9 @@ def _estimate(
     if terms:
         others = lidars_with_structure(terms)
         grounds = other_grounds(grounds, terms)
-        problem = pose_problem(observations, trajectories, config, noise.heave_m, others, kept)
+        problem = pose_problem(
+            observations, trajectories, config, noise.heave_m, others, kept, noise.floors
+        )
         problem = replace(problem, moved_with=extrinsics)
         solve, offsets_s = solved_with_structure(
             problem, registrations, grounds, config, found, terms, extrinsics

@@ -16,10 +16,12 @@ import numpy as np
 
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.ground_factors import (
+    SWAY_SIGMA_RAD,
     ground_plane_factor,
     parallel_factor,
     standing_factor,
 )
+from caliv_graph.calibration.ground_floors import sharing_places
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.rates import swept_drives
 from caliv_graph.config.model import GroundConfig
@@ -177,23 +179,39 @@ def ground_graph(
             rates = key_rates(o.drive) if o.drive in problem.rate_rows else None
             factor = ground_plane_factor(keys, plane, centre, o, weight, heave_m, bias, rates)
             graph.append("ground_plane", factor)
+    waves = _waves_below(problem, weights.stands)
     for i, ((drive, _), weight) in enumerate(
         zip(problem.poses, weights.stands.tolist(), strict=True)
     ):
         if weight <= 0.0 or drive not in centres:
             continue
         X, plane = key_vehicle(i), key_ground(drive)
+        tilt_rad, lift_m = waves[i].tolist()
         if config.vehicle_height is not None:
-            height = config.vehicle_height
-            factor = standing_factor(
-                X, plane, key_height(drive), centres[drive], height, weight, problem.heave_m
-            )
+            error, height = key_height(drive), config.vehicle_height
+            sigma = math.hypot(problem.heave_m, lift_m)
+            factor = standing_factor(X, plane, error, centres[drive], height, weight, sigma)
             graph.append("standing", factor)
         if config.parallel_sigma_deg is not None:
-            graph.append(
-                "parallel", parallel_factor(X, plane, key_parallel(drive), weight, sway_rad)
-            )
+            sigma = math.hypot(SWAY_SIGMA_RAD if sway_rad is None else sway_rad, tilt_rad)
+            factor = parallel_factor(X, plane, key_parallel(drive), weight, sigma)
+            graph.append("parallel", factor)
     return graph
+
+
+def _waves_below(problem: Problem, stands: Array) -> Array:
+    """(m, 2) 1 sigma of tilt and height of the ground below each pose against its drive's plane.
+
+    Waves stay where they are, as for scans of the ground (`ground_floors.sharing_scans`): poses of
+    one place know them once, and each counts for its part. `stands` (m,) are weights.
+    """
+    shares = np.ones(len(stands))
+    of_drive = problem.drives()
+    for drive in np.unique(of_drive).tolist():
+        own = np.flatnonzero((of_drive == drive) & (stands > 0.0))
+        places = [problem.T_map_vehicle[i].translation() for i in own.tolist()]
+        shares[own] = sharing_places(np.array(places).reshape(-1, 3), stands[own])
+    return np.sqrt(shares)[:, None] * problem.floors[[0, 2]]
 
 
 def place_weights(

@@ -65,12 +65,22 @@ def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
         axes_map: (N, 2, 3) of a and b.
         centres_map: (N, 3) of the discs, metres.
     """
-    apart = np.linalg.norm(centres_map[:, None] - centres_map[None], axis=2)
-    overlap = disc_overlap(apart / (2.0 * RADII_M[-1]))
+    overlap = _overlap(centres_map)
     # Half the trace of axes_i axes_j^T: the cosine of how far the LiDAR turned between them.
     along = 0.5 * np.einsum("nki,mki->nm", axes_map, axes_map, optimize=True)
     tilts = np.maximum((overlap * along).sum(axis=1), 1.0)
     return np.column_stack([tilts, tilts, overlap.sum(axis=1)])
+
+
+def sharing_places(centres_map: Array, weights: Array) -> Array:
+    """(N,) the same of the height at places (N, 3), metres, that count with `weights` (N,)."""
+    return np.maximum(_overlap(centres_map) @ weights, 1.0)
+
+
+def _overlap(centres_map: Array) -> Array:
+    """(N, N) parts of their area that discs share."""
+    apart = np.linalg.norm(centres_map[:, None] - centres_map[None], axis=2)
+    return disc_overlap(apart / (2.0 * RADII_M[-1]))
 
 
 def disc_overlap(x: Array) -> Array:

@@ -145,7 +145,8 @@ def _standing(
         g, centre = values.atVector(key_ground(drive)), ground_centre(problem, drive)
         poses = [problem.T_map_vehicle[i] for i in alike.tolist()]
         height = np.array([[height_over(g, centre, T.translation())[0]] for T in poses])
-        stands[alike] *= _group_weights(height, np.full_like(height, problem.heave_m))
+        usual_m = math.hypot(problem.heave_m, problem.floors[2])
+        stands[alike] *= _group_weights(height, np.full_like(height, usual_m))
         tilt = np.array([(T.rotation().matrix().T @ plane_normal(g))[:2] for T in poses])
         off = np.linalg.norm(tilt - np.median(tilt, axis=0), axis=1)
         stands[alike] *= _falling(off, *TILT_RAD)

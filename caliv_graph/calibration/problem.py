@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
@@ -25,6 +25,7 @@ from caliv_graph.calibration.vehicle_parameters import (
 )
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, configured_guess
 from caliv_graph.config.model import Config
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.conventions import (
     NANOSECONDS_PER_SECOND,
     key_extrinsic,
@@ -39,6 +40,7 @@ from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack
 from caliv_graph.products import Array, BoolArray, IntArray, TargetCloud, TargetObservation
 from caliv_graph.targets.cloud.views import views
+from caliv_graph.targets.ground.planes import ground_floors
 from caliv_graph.trajectory.noise import given_pose_covariances
 from caliv_graph.trajectory.rates import rate_rows_of_drives, turn_variances
 from caliv_graph.trajectory.select import (
@@ -96,6 +98,8 @@ class Problem:
         views: (J,) clouds of its LiDAR that have the view of each (`targets.cloud.views`); None:
             all differ.
         heave_m: 1 sigma of the heave at each pose.
+        floors: (3,) 1 sigma of (a, b, distance) of the ground at a place against the plane of its
+            drive: its waves.
         rate_rows: per drive the (RATES, 6 m) derivatives of the errors of its rates by its m poses
             (`trajectory.rates`); none where an odometry gave them.
         cloud_apart_s: (J,) mean time of the points of each cloud after its stamp, to which they
@@ -127,6 +131,7 @@ class Problem:
     stated_cov: Array | None = None
     views: Array | None = None
     heave_m: float = field(default_factory=usual_heave_m)
+    floors: Array = field(default_factory=partial(ground_floors, NoiseConfig()))
     rate_rows: Mapping[int, Array] = field(default_factory=dict)
     cloud_apart_s: Array | None = None
     cloud_turn_rad: Array | None = None
@@ -322,6 +327,7 @@ def pose_problem(
     heave_m: float | None = None,
     others: Collection[str] = (),
     kept_ns: Mapping[int, Sequence[int] | IntArray] | None = None,
+    floors: Array | None = None,
 ) -> Problem:
     """Lists LiDARs, poses and clouds that take part: long for the fields of a record.
 
@@ -332,6 +338,7 @@ def pose_problem(
         heave_m: 1 sigma of the heave; None: that of the config, or the usual one.
         others: names of LiDARs that take part without having seen a target.
         kept_ns: per drive, stamps of further poses; they have nodes.
+        floors: (3,) of the waves of the ground; None: those of the config, or the usual ones.
 
     Raises:
         SolveError: there is neither a cloud nor another pose.
@@ -403,6 +410,7 @@ def pose_problem(
         stated_cov=_stated_covariances(trajectories, poses, config),
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
+        floors=ground_floors(config.noise) if floors is None else floors,
         rate_rows=rate_rows_of_drives(trajectories, of_pose),
         cloud_apart_s=apart_s,
         cloud_turn_rad=_turns(clouds, smoothed) if apart_s.any() else None,

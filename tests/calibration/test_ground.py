@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -428,6 +429,31 @@ def test_factors_by_role() -> None:
     assert ground_graph(case.problem, observations, HEIGHT_KNOWN, weights).size() == 4
 
 
+def test_the_waves_below_a_vehicle_count_once_per_place() -> None:
+    """Half a millimetre of heave is no reason to believe that a yard is as flat."""
+    case = make_case(count=4)
+    here, far = gtsam.Pose3(gtsam.Rot3(), np.zeros(3)), gtsam.Pose3(gtsam.Rot3(), [99.0, 0.0, 0.0])
+    problem = replace(
+        case.problem,
+        T_map_vehicle=(here, here, here, far),
+        heave_m=5e-4,
+        floors=np.array([1e-3, 1e-3, 4e-3]),
+    )
+    observations = observed(problem, case.truth, np.zeros(3))
+    config = GroundConfig(vehicle_height=0.1, parallel_sigma_deg=0.1)
+    graph = ground_graph(problem, observations, config, sway_rad=2e-3)
+
+    factors: list[Any] = [graph.at(i) for i in range(graph.size())]
+    for kind, own, wave in (("standing", 5e-4, 4e-3), ("parallel", 2e-3, 1e-3)):
+        sigmas = [
+            factor.noiseModel().sigmas()[0]
+            for of, factor in zip(graph.kinds, factors, strict=True)
+            if of == kind
+        ]
+        three, one = math.hypot(own, math.sqrt(3.0) * wave), math.hypot(own, wave)
+        assert sigmas == pytest.approx([three] * 3 + [one])
+
+
 def test_moving_the_map_changes_nothing() -> None:
     shift = np.array([300.0, -500.0, 40.0])
     g = np.array([0.03, -0.02, -0.4])
@@ -568,9 +594,10 @@ def test_parallel_gives_roll_on_a_straight_drive_to_its_sigma() -> None:
         prior_graph(case.problem, case.problem.lidars),
     )
     unit = scaling(2)
+    flat = replace(case.problem, floors=np.zeros(3))
     for degrees, expected in ((0.05, 8.7e-4), (0.5, 8.7e-3)):
         config = GroundConfig(vehicle_height=VEHICLE_HEIGHT, parallel_sigma_deg=degrees)
-        graph = merged(base, ground_graph(case.problem, observations, config))
+        graph = merged(base, ground_graph(flat, observations, config))
         cov = np.linalg.inv(vehicle_information(case, graph, values)) * np.outer(unit, unit)
         # With 16 scans of sway, which the drive does not know either.
         sway = math.hypot(expected, 1e-3 / 4.0)

@@ -32,7 +32,8 @@ CORRELATED_M = 0.02
 """1 sigma of the Gauss-Markov error of the fixes, per axis."""
 
 GOOD = 0.1
-"""Noise of a gyroscope of which a scale that is off can be told, over the nominal one."""
+"""Noise of a gyroscope over the nominal one, in the row whose gyroscope has a wrong scale: the
+nominal noise would hide it."""
 
 CORRELATED_RAD = 2e-3
 """1 sigma of the Gauss-Markov error of the orientation, per axis: the slow error of a good AHRS."""

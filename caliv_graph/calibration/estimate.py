@@ -154,9 +154,7 @@ def _estimate(
         told = structure.slow_errors(trajectories, start, extrinsics, config)
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
-        problem = pose_problem(
-            observations, trajectories, config, noise.heave_m, kept_ns=kept, floors=noise.floors
-        )
+        problem = pose_problem(observations, trajectories, config, noise, kept_ns=kept)
     times = {"registration": rough.registration_s}
 
     # Register again, from the solved graph: EM ends near where it starts, and the result shall
@@ -198,9 +196,7 @@ def _estimate(
     if terms:
         others = lidars_with_structure(terms)
         grounds = other_grounds(grounds, terms)
-        problem = pose_problem(
-            observations, trajectories, config, noise.heave_m, others, kept, noise.floors
-        )
+        problem = pose_problem(observations, trajectories, config, noise, others, kept)
         problem = replace(problem, moved_with=extrinsics)
         solve, offsets_s = solved_with_structure(
             problem, registrations, grounds, config, found, terms, extrinsics

@@ -179,6 +179,8 @@ def ground_graph(
             rates = key_rates(o.drive) if o.drive in problem.rate_rows else None
             factor = ground_plane_factor(keys, plane, centre, o, weight, heave_m, bias, rates)
             graph.append("ground_plane", factor)
+    if config.vehicle_height is None and config.parallel_sigma_deg is None:
+        return graph
     waves = _waves_below(problem, weights.stands)
     for i, ((drive, _), weight) in enumerate(
         zip(problem.poses, weights.stands.tolist(), strict=True)

@@ -152,7 +152,7 @@ def solve_structure_and_ground(
     times = {"structure": time.perf_counter() - begun}
     begun = time.perf_counter()
     stamps = {term.drive: term.stamps_ns for term in terms}
-    problem = pose_problem([], trajectories, config, noise.heave_m, others, stamps, noise.floors)
+    problem = pose_problem([], trajectories, config, noise, others, stamps)
     with progress.stage("solving the graph", COUPLED_STEPS) as advance:
         loop = _Loop(problem, terms, grounds, config, pose_noise)
         loop.solve(advance)

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -320,14 +321,25 @@ def moved_map(T_map_vehicle: gtsam.Pose3, shift: Array) -> gtsam.Pose3:
     return gtsam.Pose3(T_map_vehicle.rotation(), T_map_vehicle.translation() + shift)
 
 
+class Levels(Protocol):
+    """Noise levels of body and ground, as `sensor_noise.SensorNoise` has them."""
+
+    @property
+    def heave_m(self) -> float:
+        """1 sigma of the heave."""
+
+    @property
+    def floors(self) -> Array:
+        """(3,) 1 sigma of the waves of the ground, as in `Problem`."""
+
+
 def pose_problem(
     observations: Sequence[TargetObservation],
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
-    heave_m: float | None = None,
+    noise: Levels | None = None,
     others: Collection[str] = (),
     kept_ns: Mapping[int, Sequence[int] | IntArray] | None = None,
-    floors: Array | None = None,
 ) -> Problem:
     """Lists LiDARs, poses and clouds that take part: long for the fields of a record.
 
@@ -335,17 +347,17 @@ def pose_problem(
         observations: clouds of each target placement.
         trajectories: one per drive.
         config: LiDARs, noise.
-        heave_m: 1 sigma of the heave; None: that of the config, or the usual one.
+        noise: what the data say of heave and ground; None: figures of the config, or the usual
+            ones.
         others: names of LiDARs that take part without having seen a target.
         kept_ns: per drive, stamps of further poses; they have nodes.
-        floors: (3,) of the waves of the ground; None: those of the config, or the usual ones.
 
     Raises:
         SolveError: there is neither a cloud nor another pose.
     """
     clouds = [(o.placement, c) for o in observations for c in o.clouds]
     further = {(d, int(stamp)) for d, stamps in (kept_ns or {}).items() for stamp in stamps}
-    heave_m = config.noise.heave_m or heave_m or HEAVE_SIGMA_M
+    heave_m = config.noise.heave_m or (noise.heave_m if noise else HEAVE_SIGMA_M)
     seen = {c.lidar for _, c in clouds} | set(others)
     lidars = tuple(n for n in config.lidars if n in seen or config.lidars[n].fixed)
     poses = tuple(sorted({(c.drive, c.stamp_ns) for _, c in clouds} | further))
@@ -410,7 +422,7 @@ def pose_problem(
         stated_cov=_stated_covariances(trajectories, poses, config),
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
-        floors=ground_floors(config.noise) if floors is None else floors,
+        floors=noise.floors if noise else ground_floors(config.noise),
         rate_rows=rate_rows_of_drives(trajectories, of_pose),
         cloud_apart_s=apart_s,
         cloud_turn_rad=_turns(clouds, smoothed) if apart_s.any() else None,

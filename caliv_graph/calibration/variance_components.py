@@ -254,7 +254,7 @@ def maximise_exactly(cost: Cost, unknowns: Sequence[Unknown], start: Array) -> t
     """`maximise` to where rounding does not matter any more, where there is one maximum.
 
     Newton's method with the average information, which is good far from the maximum. Near it that
-    would take many steps: the last one is corrected by how the slopes change (BFGS).
+    would take many steps: the last information is corrected by how the slopes change (BFGS).
     """
     penalised = _penalised(cost, unknowns)
     low, high = np.log([u.bounds for u in unknowns]).T

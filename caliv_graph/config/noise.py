@@ -67,7 +67,8 @@ class NoiseConfig(Section):
     orientation_correlated_deg: NonNegative | None = Field(
         None,
         description="degrees, first-order Gauss-Markov error of the IMU's orientation, about every "
-        "map axis; absent: estimated; 0: none",
+        "map axis; absent: estimated, and none about level axes while that of the yaw is given; "
+        "0: none",
     )
     orientation_correlated_yaw_deg: NonNegative | None = Field(
         None, description="degrees, the same about the vertical; absent: as about the others"

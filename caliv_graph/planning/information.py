@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caliv_graph.calibration.ground import GROUND_BIASES, TOGETHER_NS, bias_sigmas
+from caliv_graph.calibration.ground_floors import sharing_places
 from caliv_graph.calibration.ground_weights import TILT_RAD
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.geometry.se3 import skew
@@ -359,12 +360,14 @@ def _add_contact(
 ) -> None:
     """Adds that the vehicle stands on the plane, at the nodes `at`; see `_seen_plane`."""
     R, place = R[at], place[at]
-    sigma_m = max(assumptions.heave_sigma_m, LEAST_HEAVE_M)
+    # Waves below the vehicle count once per place, as in `calibration.ground`.
+    waves = assumptions.ground_distance_sigma_m**2 * sharing_places(place, np.ones(len(place)))
+    variances = max(assumptions.heave_sigma_m, LEAST_HEAVE_M) ** 2 + waves
     J = np.zeros((len(at), 1, H.shape[1]))
     J[:, 0, 3:6] = R[:, 2]
     J[:, 0, POSE + columns.plane : POSE + columns.plane + 2] = -place[:, :2]
     J[:, 0, POSE + columns.plane + 2] = J[:, 0, POSE + columns.height] = -1.0
-    H[at] += np.swapaxes(J, 1, 2) @ J / sigma_m**2
+    H[at] += np.swapaxes(J, 1, 2) @ J / variances[:, None, None]
 
 
 def _plane_axes(motion: PlannedMotion, drive: Route) -> Array:

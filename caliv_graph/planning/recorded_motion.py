@@ -115,7 +115,7 @@ def _of_sensors(trajectory: SmoothedTrajectory, begin_ns: int, height_m: float) 
             f"{data.name}: wheels without an IMU, for which a prediction has no model. {INSTEAD}"
         )
     slow = {error.kind: error for error in trajectory.correlated}
-    notes = [slow_error_sentence(e.kind, e.sigmas[0], e.time_s) for e in slow.values()]
+    notes = [slow_error_sentence(e.kind, _size(e), e.time_s) for e in slow.values()]
     if data.headings is not None or data.baselines is not None:
         notes.append(heading_sentence())
     return RecordedMotion(
@@ -126,6 +126,11 @@ def _of_sensors(trajectory: SmoothedTrajectory, begin_ns: int, height_m: float) 
         gravity_m_s2=round(trajectory.gravity_m_s2, 5),
         notes=tuple(notes),
     )
+
+
+def _size(error: CorrelatedError) -> float:
+    """1 sigma of an error in scenarios and sentences: horizontal; tilt or yaw, the larger."""
+    return error.sigmas[0] if error.kind == "gnss" else max(error.sigmas)
 
 
 def _imu(
@@ -141,7 +146,7 @@ def _imu(
         cov, _ = orientation_covariances(imu, data.config)
         orientation = OrientationModel(
             sigma_rad=_sigma(cov[usable_orientations(imu)]),
-            correlated_sigma_rad=0.0 if slow is None else _rounded(slow.sigmas[0]),
+            correlated_sigma_rad=0.0 if slow is None else _rounded(_size(slow)),
             correlation_s=TYPICAL_CORRELATION_S if slow is None else _rounded(slow.time_s),
         )
     return ImuModel(

@@ -26,7 +26,7 @@ from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.noise import configured_errors
 from caliv_graph.trajectory.outliers import dropped_warnings, solve_without_outliers
-from caliv_graph.trajectory.parameters import UncertainParameter
+from caliv_graph.trajectory.parameters import GYROSCOPE, UncertainParameter
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import (
     ROUGH_TOLERANCE,
@@ -111,6 +111,7 @@ def smooth_trajectory(
     kept = np.unique(nearest_node(nodes, wanted)) if len(wanted) else None
     chain = last.chain if kept is None else last.chain.only(kept)
     warnings += [*dropped_warnings(robust), *_bias_warnings(data, estimate.states)]
+    warnings += _gyroscope_warnings(data, last.settled.parameters)
     return SmoothedTrajectory(
         trajectory=_at_wanted(data, wanted, nodes, estimate.states, last.cov),
         lost_ns=tuple(lost.tolist()),
@@ -242,6 +243,22 @@ def _roughly_settled(
     begun = [solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE)]
     settled = settle(data, nodes, begun.pop(), none, "huber", parameters, ROUGH_TOLERANCE)
     return settled.data, settled.estimate.states, settled.parameters
+
+
+def _gyroscope_warnings(data: SmootherInput, parameters: Sequence[UncertainParameter]) -> list[str]:
+    """A line if scale and axes of the gyroscope are off by more than their prior explains."""
+    out = []
+    for p in parameters:
+        if p.parameter is GYROSCOPE and p.offset is not None and p.sigmas is not None:
+            most = float(np.abs(p.offset).max())
+            if most > BIAS_SIGMAS * p.sigmas[0]:
+                out.append(
+                    f"{data.name}: the gyroscope reads {100.0 * most:.2g} percent of the vehicle's "
+                    "turn too much or too little, by its scale or its axes, and "
+                    f"imu.gyroscope_scale_sigma is {100.0 * p.sigmas[0]:.2g} percent: check its "
+                    "unit and range, or state a larger sigma"
+                )
+    return out
 
 
 def _bias_warnings(data: SmootherInput, states: States) -> list[str]:

@@ -24,7 +24,7 @@ def slow_error_sentence(kind: str, sigma: float, time_s: float) -> str:
     """An error that changes slowly; `sigma` in metres of a fix, radians of an orientation."""
     what = f"{sigma:.3f} m" if kind == "gnss" else f"{math.degrees(sigma):.3f} degrees"
     return (
-        f"{_SENSORS[kind]} have errors that are correlated over time, {what} over {time_s:.0f} s, "
+        f"errors of {_SENSORS[kind]} are correlated over time, {what} over {time_s:.0f} s, "
         "which no predicted sigma includes"
     )
 

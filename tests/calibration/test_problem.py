@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.linear import retract
-from caliv_graph.calibration.problem import Problem, pose_problem
+from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem, pose_problem
+from caliv_graph.calibration.sensor_noise import SensorNoise
 from caliv_graph.config.guesses import TRUSTED_SIGMAS
 from caliv_graph.config.lidars import LidarConfig, PoseSigmaConfig
 from caliv_graph.config.model import Config
@@ -19,6 +20,7 @@ from caliv_graph.conventions import key_extrinsic, key_sensor, key_target, key_v
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.products import TargetCloud, TargetObservation, Trajectory
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.calibration.problems import make_case, moved
 from tests.samples import MOUNTINGS, pose
@@ -89,6 +91,19 @@ def test_poses_are_those_of_clouds_in_order_of_drive_and_stamp() -> None:
     assert problem.placements == 2
     assert problem.drives().tolist() == [0, 0, 1, 1]
     assert problem.times_s()[:2] == pytest.approx([0.0, 20e-9])
+
+
+def test_heave_and_waves_are_those_of_the_data() -> None:
+    known = SensorNoise(0.002, np.array([1e-3, 1e-3, 7e-3]))
+    observations = [observed(0, ("front", 0, 10), ("front", 0, 20))]
+
+    problem = pose_problem(observations, [drive(10, 20)], config_of("front"), known)
+
+    assert problem.heave_m == 0.002
+    assert problem.floors.tolist() == [1e-3, 1e-3, 7e-3]
+    usual = pose_problem(observations, [drive(10, 20)], config_of("front"))
+    assert usual.heave_m == HEAVE_SIGMA_M
+    assert usual.floors.tolist() == [NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M]
 
 
 def test_lidars_keep_the_order_of_the_config() -> None:

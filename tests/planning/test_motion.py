@@ -267,7 +267,7 @@ def test_grounds_information_is_that_of_numerical_derivatives() -> None:
         return np.concatenate(
             [
                 T.rotation().matrix().T @ normal_seen / NORMAL_FLOOR_RAD,
-                [over / DISTANCE_FLOOR_M, stands / 0.005],
+                [over / DISTANCE_FLOOR_M, stands / math.hypot(0.005, DISTANCE_FLOOR_M)],
             ]
         )
 

@@ -38,6 +38,7 @@ from caliv_graph.scenario.world_models import (
     RampModel,
     WorldModel,
 )
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M
 from tests.drives_with_chair import paper_lidar, paper_scenario
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
@@ -295,7 +296,9 @@ def test_height_is_as_good_as_that_of_the_vehicle() -> None:
     for sigma_m in (0.002, 0.01):
         prediction = planned("figure-eight", "height", ground_height_sigma_m=sigma_m)
 
-        assert prediction.sigma_s2v["front"][5] == pytest.approx(sigma_m, rel=0.05)
+        # And as waves of the ground below it, which it sees at several places.
+        z = prediction.sigma_s2v["front"][5]
+        assert 0.95 * sigma_m < z < 1.02 * math.hypot(sigma_m, DISTANCE_FLOOR_M)
 
 
 def test_a_vehicle_that_heaves_knows_its_height_no_better() -> None:

@@ -119,6 +119,12 @@ def test_the_scale_and_the_axes_of_a_gyroscope_are_estimated() -> None:
     exact = smooth_trajectory(motion, config_for(sensors), WANTED)
     assert smoothed.data.scales["gyroscope"] < 0.15
     assert exact.data.scales["gyroscope"] > 0.5
+    # Twenty of its sigmas are said, two are not.
+    assert not any("gyroscope" in line for line in smoothed.warnings)
+    narrow = config_for(sensors, imu={"gyroscope_scale_sigma": 2e-4})
+    said = [w for w in smooth_trajectory(motion, narrow, WANTED).warnings if "gyroscope" in w]
+    assert len(said) == 1
+    assert "imu.gyroscope_scale_sigma is 0.02 percent" in said[0]
 
 
 @pytest.mark.parametrize(("late_s", "sigma_s"), [(0.0, 1e-4), (0.08, 0.02)])

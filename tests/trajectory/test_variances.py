@@ -20,6 +20,7 @@ from caliv_graph.trajectory.effects import (
     poses_and_gain,
     smoothed_in_time,
 )
+from caliv_graph.trajectory.noise import configured_errors
 from caliv_graph.trajectory.select import noise_scales
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -306,6 +307,21 @@ def test_a_correlated_error_widens_the_covariance_as_far_as_the_gain_says() -> N
     assert ratio.min() > 0.999
     assert ratio[:, 3:].max() < 1.1
     assert large.correlated[0].sigmas == (0.02, 0.02, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "yaw_deg", "sigmas_deg"),
+    [(0.1, None, (0.1, 0.1, 0.1)), (0.1, 0.2, (0.1, 0.1, 0.2)), (None, 0.2, (0.0, 0.0, 0.2))],
+)
+def test_an_orientation_errs_about_the_vertical_by_a_size_of_its_own(
+    tilt_deg: float | None, yaw_deg: float | None, sigmas_deg: tuple[float, ...]
+) -> None:
+    stated = {"orientation_correlated_deg": tilt_deg, "orientation_correlated_yaw_deg": yaw_deg}
+
+    (error,) = configured_errors(config_for(Sensors(), noise=stated))
+
+    assert error.kind == "orientation"
+    assert np.degrees(error.sigmas) == pytest.approx(sigmas_deg, abs=1e-4)
 
 
 def test_correlated_errors_of_the_config_are_used() -> None:

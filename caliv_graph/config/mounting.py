@@ -89,7 +89,7 @@ class ImuConfig(Section):
         "absent: 0.1, and none where T_vehicle_imu is absent or the identity",
     )
     gyroscope_scale_sigma: NonNegative = Field(
-        2e-3,
+        1e-3,
         description="radians per radian, sigma of the error of its gyroscope's scale, and of the "
         "directions of its axes; 0: exact",
     )

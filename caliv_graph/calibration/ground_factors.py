@@ -248,12 +248,12 @@ def standing_factor(
     centre: Array,
     vehicle_height_m: float,
     weight: float = 1.0,
-    sigma_m: float = HEAVE_SIGMA_M,
+    sigma_m: float | None = None,
 ) -> gtsam.CustomFactor:
     """Role b: `r = height of the vehicle frame over the plane - vehicle_height - error`.
 
-    Its sigma is that of one scan, by heave and waves of the ground; the error (`key_error`) is
-    common to the drive.
+    Its sigma is that of one scan, by heave and waves of the ground (None: the usual heave); the
+    error (`key_error`) is common to the drive.
     `centre` (2,) metres is where the plane's height is defined; `weight` is on the information.
     """
 
@@ -268,6 +268,7 @@ def standing_factor(
             jacobians[2] = -np.ones((1, 1))
         return np.asarray(height - vehicle_height_m - values.atVector(key_error))
 
+    sigma_m = HEAVE_SIGMA_M if sigma_m is None else sigma_m
     noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_m / math.sqrt(weight))
     return gtsam.CustomFactor(noise, [key_pose, key_plane, key_error], error)
 
@@ -277,11 +278,11 @@ def parallel_factor(
     key_plane: int,
     key_tilt: int,
     weight: float = 1.0,
-    sigma_rad: float = SWAY_SIGMA_RAD,
+    sigma_rad: float | None = None,
 ) -> gtsam.CustomFactor:
     """Role c: `r` = x and y of the plane's normal in the vehicle frame, less the drive's tilt.
 
-    Its sigma is that of one scan, by sway and waves of the ground.
+    Its sigma is that of one scan, by sway and waves of the ground (None: the usual sway).
     """
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -296,5 +297,6 @@ def parallel_factor(
             jacobians[2] = -np.eye(2)
         return np.asarray(n_vehicle[:2] - values.atVector(key_tilt))
 
+    sigma_rad = SWAY_SIGMA_RAD if sigma_rad is None else sigma_rad
     noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma_rad / math.sqrt(weight))
     return gtsam.CustomFactor(noise, [key_pose, key_plane, key_tilt], error)

@@ -132,12 +132,13 @@ def test_a_constant_changes_a_drive(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     scenario = load_scenario(drives.SCENARIOS / "demo_arc.yaml")
     # Few clouds are enough for a change: `SMALL` takes 12 of each LiDAR.
     lidars = {n: li.model_copy(update={"rate_hz": 1.25}) for n, li in scenario.lidars.items()}
-    recording = KeptDrive(scenario.model_copy(update={"lidars": lidars}), 1)
+    # Of seeds 1 and 6 the noise of the poses, fitted to so few clouds, leaves none with a weight.
+    recording = KeptDrive(scenario.model_copy(update={"lidars": lidars}), 3)
     monkeypatch.setattr(drives, "_recording", lambda *_: recording)
 
-    own = drives.performed("given", 1, tmp_path, SMALL, early=False)
+    own = drives.performed("given", 3, tmp_path, SMALL, early=False)
     with patched("caliv_graph.registration.quadratic", "NORMAL_SIGMA_RAD", 0.8):
-        other = drives.performed("given", 1, tmp_path, SMALL, early=False)
+        other = drives.performed("given", 3, tmp_path, SMALL, early=False)
 
     found = benchmark.effect([own], [other])
     assert not found.same

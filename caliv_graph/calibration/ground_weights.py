@@ -138,6 +138,7 @@ def _standing(
     stands = np.zeros(len(problem.poses))
     np.maximum.at(stands, taken[taken >= 0], planes[taken >= 0])
     of_drive = problem.drives()
+    usual_m = math.hypot(problem.heave_m, problem.floors[2])
     for drive in seen_drives(observations, taken):
         alike = np.flatnonzero((of_drive == drive) & (stands > 0.0))
         if not len(alike):
@@ -145,7 +146,6 @@ def _standing(
         g, centre = values.atVector(key_ground(drive)), ground_centre(problem, drive)
         poses = [problem.T_map_vehicle[i] for i in alike.tolist()]
         height = np.array([[height_over(g, centre, T.translation())[0]] for T in poses])
-        usual_m = math.hypot(problem.heave_m, problem.floors[2])
         stands[alike] *= _group_weights(height, np.full_like(height, usual_m))
         tilt = np.array([(T.rotation().matrix().T @ plane_normal(g))[:2] for T in poses])
         off = np.linalg.norm(tilt - np.median(tilt, axis=0), axis=1)

@@ -321,8 +321,11 @@ def moved_map(T_map_vehicle: gtsam.Pose3, shift: Array) -> gtsam.Pose3:
     return gtsam.Pose3(T_map_vehicle.rotation(), T_map_vehicle.translation() + shift)
 
 
-class Levels(Protocol):
-    """Noise levels of body and ground, as `sensor_noise.SensorNoise` has them."""
+class BodyAndGround(Protocol):
+    """What the data say of heave and waves, as `sensor_noise.SensorNoise` has it.
+
+    Figures that the config states are in it as they are stated.
+    """
 
     @property
     def heave_m(self) -> float:
@@ -337,7 +340,7 @@ def pose_problem(
     observations: Sequence[TargetObservation],
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
-    noise: Levels | None = None,
+    noise: BodyAndGround | None = None,
     others: Collection[str] = (),
     kept_ns: Mapping[int, Sequence[int] | IntArray] | None = None,
 ) -> Problem:
@@ -357,7 +360,10 @@ def pose_problem(
     """
     clouds = [(o.placement, c) for o in observations for c in o.clouds]
     further = {(d, int(stamp)) for d, stamps in (kept_ns or {}).items() for stamp in stamps}
-    heave_m = config.noise.heave_m or (noise.heave_m if noise else HEAVE_SIGMA_M)
+    if noise is None:
+        heave_m, floors = config.noise.heave_m or HEAVE_SIGMA_M, ground_floors(config.noise)
+    else:
+        heave_m, floors = noise.heave_m, noise.floors
     seen = {c.lidar for _, c in clouds} | set(others)
     lidars = tuple(n for n in config.lidars if n in seen or config.lidars[n].fixed)
     poses = tuple(sorted({(c.drive, c.stamp_ns) for _, c in clouds} | further))
@@ -422,7 +428,7 @@ def pose_problem(
         stated_cov=_stated_covariances(trajectories, poses, config),
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
-        floors=noise.floors if noise else ground_floors(config.noise),
+        floors=floors,
         rate_rows=rate_rows_of_drives(trajectories, of_pose),
         cloud_apart_s=apart_s,
         cloud_turn_rad=_turns(clouds, smoothed) if apart_s.any() else None,

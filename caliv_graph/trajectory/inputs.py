@@ -137,6 +137,11 @@ class SmootherInput:
         return self.config.wheels.scale_sigma(self.speed_alone or self.wheels is not None)
 
     @property
+    def gyroscope_scale_sigma(self) -> float | None:
+        """Of the gyroscope's scale and axes; None: they are exact, or there is none."""
+        return (self.config.imu.gyroscope_scale_sigma or None) if self.wheels is None else None
+
+    @property
     def arm_imu(self) -> Array:
         """(3,) the GNSS antenna in the imu frame, metres."""
         return np.asarray(self.T_vehicle_imu.transformTo(self.lever_arm))

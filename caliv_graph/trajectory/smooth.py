@@ -247,18 +247,19 @@ def _roughly_settled(
 
 def _gyroscope_warnings(data: SmootherInput, parameters: Sequence[UncertainParameter]) -> list[str]:
     """A line if scale and axes of the gyroscope are off by more than their prior explains."""
-    out = []
-    for p in parameters:
-        if p.parameter is GYROSCOPE and p.offset is not None and p.sigmas is not None:
-            most = float(np.abs(p.offset).max())
-            if most > BIAS_SIGMAS * p.sigmas[0]:
-                out.append(
-                    f"{data.name}: the gyroscope reads {100.0 * most:.2g} percent of the vehicle's "
-                    "turn too much or too little, by its scale or its axes, and "
-                    f"imu.gyroscope_scale_sigma is {100.0 * p.sigmas[0]:.2g} percent: check its "
-                    "unit and range, or state a larger sigma"
-                )
-    return out
+    sigma = data.gyroscope_scale_sigma
+    if sigma is None:
+        return []
+    (offset,) = (np.asarray(p.offset) for p in parameters if p.parameter is GYROSCOPE)
+    most = float(np.abs(offset).max())
+    if most <= BIAS_SIGMAS * sigma:
+        return []
+    return [
+        f"{data.name}: the gyroscope reads {100.0 * most:.2g} percent of the vehicle's turn "
+        "too much or too little, by its scale or its axes, and "
+        f"imu.gyroscope_scale_sigma is {100.0 * sigma:.2g} percent: check its unit and range, or "
+        "state a larger sigma"
+    ]
 
 
 def _bias_warnings(data: SmootherInput, states: States) -> list[str]:

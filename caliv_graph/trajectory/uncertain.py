@@ -120,8 +120,8 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
     place = data.config.imu.place_sigma()
     if place is not None and data.wheels is None and _has_place(data):
         out.append(UncertainParameter(IMU_PLACE, np.full(3, place), np.zeros(3)))
-    response = data.config.imu.gyroscope_scale_sigma
-    if response and data.wheels is None:
+    response = data.gyroscope_scale_sigma
+    if response is not None:
         out.append(UncertainParameter(GYROSCOPE, np.full(3, response), np.zeros(3)))
     out += _clocks(data)
     wheels = data.config.wheels

@@ -140,7 +140,7 @@ def estimated_scales(
     typed = [rotation] if data.positions is None else [LEVER_ARM, rotation, GNSS_TIME_OFFSET]
     if data.motion.twist is not None and data.speed_scale_sigma:
         typed.append(speed_scale(data))
-    typed += [GYROSCOPE] if data.config.imu.gyroscope_scale_sigma and data.wheels is None else []
+    typed += [GYROSCOPE] if data.gyroscope_scale_sigma is not None else []
     typed += [SPEED_POINT] if data.speed_alone else []
     if data.wheels is not None:
         typed += [LEAN, AXLE_SLIP] if data.wheels.planar else [LEAN]

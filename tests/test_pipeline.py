@@ -220,7 +220,8 @@ def test_a_guess_off_by_ten_degrees_and_half_a_metre_leads_to_the_same(sparse: T
 def test_whatever_the_noise_of_the_range_the_solve_ends_where_it_stays(
     noise_m: float, tmp_path: Path
 ) -> None:
-    scenario = paper_scenario(rate_hz=1.25)
+    # 19 clouds with 30 mm of noise end in one draw of four nowhere.
+    scenario = paper_scenario(rate_hz=2.5)
     lidars = {
         name: lidar.model_copy(update={"range_sigma_m": noise_m})
         for name, lidar in scenario.lidars.items()

@@ -108,4 +108,6 @@ def test_a_trusted_mounting_that_is_wrong_is_told() -> None:
     lidars["rear"] = lidars["rear"].model_copy(update={"fixed": True})  # a guess, degrees off
     run = run_on(eight().with_lidars(lidars, "rear"))
     assert run.calibration.status == "inconsistent"
-    assert any("lidar 'rear'" in text for text in run.calibration.contradictions)
+    # Which LiDAR's clouds then contradict the others, the rays that just hit an edge decide: the
+    # library that casts them differs from processor to processor.
+    assert any("lidars.rear.initial" in text for text in run.calibration.contradictions)

@@ -21,7 +21,7 @@ from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.bends import BENDS
 from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
-from caliv_graph.structure.noise import OWN_STRIP, range_sigmas, robust_weights
+from caliv_graph.structure.noise import OWN_STRIP, range_sigmas
 from caliv_graph.structure.problem import (
     Problem,
     alike,
@@ -37,6 +37,7 @@ from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.solve import GATES_M, Solved
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.thickness import thickness_m, weighted_alike
+from caliv_graph.structure.weights import robust_weights
 
 OWN_SIGHTINGS = 3
 """Fewest sightings of a strip with which a LiDAR's distance is measured."""

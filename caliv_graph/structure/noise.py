@@ -19,7 +19,7 @@ from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.sightings import Sightings
-from caliv_graph.structure.tilts import first_tilts_per_m, fitted_tilts, tilts_of
+from caliv_graph.structure.tilts import first_tilts_per_m, fitted_tilts
 from caliv_graph.structure.views import Views
 
 FIRST_SIGHTING_M = 0.01
@@ -72,10 +72,6 @@ MOST_STRIP_M = 0.05
 
 LEAST_BEND_PER_M, MOST_BEND_PER_M = 2e-4, 0.1
 """Smallest and largest sigma of a bend: 0.1 mm and 5 cm in the middle of 2 m."""
-
-SPREADS = (3.0, 6.0)
-"""Offset of a sighting in sigmas up to which it has full weight, and from which it has none; and
-its tilt, of ground."""
 
 LEAST_JITTER_S = 1e-5
 MOST_JITTER_S = 0.02
@@ -136,36 +132,7 @@ def _variance_parts(cos: Array, distance_m: Array, variance: Array) -> Array:
     return np.asarray(found)
 
 
-def robust_weights(offsets_m: Array, sightings: Sightings, nuisances: Nuisances) -> Array:
-    """(Q,) weights by the offset of each sighting: full, falling to none between `SPREADS`."""
-    variance = _variances(sightings, nuisances.sighting[sightings.strip]) + nuisances.shared**2
-    return _falling(np.abs(offsets_m) / np.sqrt(variance))
-
-
-def tilt_weights(geometry: Geometry, sightings: Sightings, level: BoolArray) -> Array:
-    """(Q,) weights by the tilt of each sighting of ground, likewise, in units of what is common.
-
-    Three rings over a kerb lie on a plane, and its middle may well be on the road's. Walls have all
-    of theirs: where a vehicle's heading errs, or its clock, they are tilted against each other, and
-    this is how it shows. `level` (K,) are the strips that are ground.
-    """
-    out = np.ones(sightings.count)
-    own = level[sightings.strip]
-    if not own.any():
-        return out
-    tilts, variances = tilts_of(sightings, geometry, own)
-    common = _common_sigma(tilts.ravel(), variances.ravel(), 1.0)
-    out[own] = _falling((np.abs(tilts) / np.sqrt(variances + common**2)).max(axis=1, initial=0.0))
-    return out
-
-
-def _falling(t: Array) -> Array:
-    """(Q,) weights by numbers of sigmas (Q,)."""
-    low, high = SPREADS
-    return np.clip((high - t) / (high - low), 0.0, 1.0)
-
-
-def _variances(sightings: Sightings, sigma_m: Array) -> Array:
+def offset_variances(sightings: Sightings, sigma_m: Array) -> Array:
     """(Q,) variance of the offset of each sighting."""
     return np.asarray(1.0 / sightings.moments[:, 3, 3] + sigma_m**2)
 
@@ -211,7 +178,7 @@ def fitted_noise(
     fitted = float((seen * asked.of_offsets).sum() / PROBES / max(weights.sum(), 1.0))
     free = 1.0 - min(fitted, MOST_FITTED)
     point = 1.0 / sightings.moments[:, 3, 3]
-    total_sigma = _common_sigma(offsets, point, free)
+    total_sigma = common_sigma(offsets, point, free)
     limit = 3.0 * np.sqrt(point + total_sigma**2)
     shared = _shared_variance(np.clip(offsets, -limit, limit), group) / free
     shared = float(np.clip(shared, LEAST_M**2, 0.9 * total_sigma**2 + LEAST_M**2))
@@ -269,7 +236,7 @@ def seen_signs(
     """
     sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)
     J = geometry.offset_rows(sightings, layout.size)
-    root = np.sqrt(weights / _variances(sightings, sigma))
+    root = np.sqrt(weights / offset_variances(sightings, sigma))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (sightings.count, PROBES))
     return np.asarray(J.T @ (root[:, None] * signs))
 
@@ -318,7 +285,7 @@ def biases_of(layout: Layout) -> IntArray:
     return np.arange(layout.error, layout.beam, BIASES)
 
 
-def _common_sigma(offsets: Array, point: Array, free: float) -> float:
+def common_sigma(offsets: Array, point: Array, free: float) -> float:
     """1 sigma of the offsets beside the noise of points: the sum of squares is as expected."""
     low, high = math.log(LEAST_M), math.log(1.0)
     for _ in range(40):

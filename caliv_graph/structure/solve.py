@@ -22,9 +22,7 @@ from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
     fitted_noise,
     range_sigmas,
-    robust_weights,
     seen_signs,
-    tilt_weights,
 )
 from caliv_graph.structure.problem import (
     Problem,
@@ -51,6 +49,7 @@ from caliv_graph.structure.thinning import (
     with_scans,
 )
 from caliv_graph.structure.tilts import FIRST_TILT_PER_M, USUAL_RAD
+from caliv_graph.structure.weights import ground_weights, robust_weights
 
 ROUGH_GATES_M = (0.3, 0.15, 0.08)
 GATES_M = (0.06, 0.06)
@@ -472,12 +471,13 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
     d = system.surfaces.follow(solved(factor, b))
     after = with_residuals(replace(found, state=stepped(found.state, layout, d)))
     geometry, state = after.geometry, after.state
+    lidar = problem.patches.scan_lidar[sightings.scan]
     nuisances = fitted_noise(
         geometry,
         seen,
         sightings,
         groups_of(sightings, found.strips),
-        problem.patches.scan_lidar[sightings.scan],
+        lidar,
         problem.views,
         found.weights,
         partial(system.surfaces.solve, factor),
@@ -490,7 +490,10 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
         tilts,
     )
     by_offset = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
-    weights = np.minimum(by_offset, tilt_weights(geometry, sightings, found.strips.level))
+    of_ground = ground_weights(
+        geometry, sightings, lidar, found.strips.level, state.errors, layout, nuisances
+    )
+    weights = np.minimum(by_offset, of_ground)
     step = d[layout.extrinsic : layout.error]
     cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
     held.append(replace(after, weights=weights, nuisances=nuisances))

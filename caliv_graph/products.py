@@ -473,6 +473,8 @@ class StructureTerm:
             none, or no ground below the vehicle was seen.
         clocks: LiDAR -> how late its stamps are and 1 sigma, seconds, by these surfaces alone, of
             the LiDARs whose offset is held at zero.
+        channels: LiDAR -> 1 sigma of the errors of one of its channels, estimated: range (m),
+            elevation and azimuth (rad).
     """
 
     drive: int
@@ -491,6 +493,7 @@ class StructureTerm:
     stance: Stance | None = None
     standing: StandingErrors | None = None
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    channels: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
+from caliv_graph.calibration.channel_errors import OwnChannels, channel_sizes
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.jackknife import jackknife_scale
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
@@ -41,6 +42,7 @@ from caliv_graph.calibration.solve import (
     covariance_of_mode,
     step_of_mode,
 )
+from caliv_graph.config.range_errors import range_errors
 from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
 from caliv_graph.products import Array, Iteration, Registration, Solution
 from caliv_graph.registration.quadratic import ShapeQuadratic
@@ -224,8 +226,8 @@ class _Loop:
 
     `prior` (6n, 6n) of the guesses; `offsets_m` (B,): biases of the ranges with which
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
-    once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement since the
-    shapes began.
+    once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement and
+    `channels` since the shapes began.
     """
 
     state: SolveState
@@ -236,6 +238,7 @@ class _Loop:
     undetermined: int | None = None
     fine: int = 0
     ranges: tuple[OwnRanges, ...] = ()
+    channels: OwnChannels | None = None
 
     def expected(self) -> tuple[_Shapes, CloudLinearisation]:
         """E-step at the poses that the graph predicts, and the derivatives of these."""
@@ -283,6 +286,7 @@ class _Loop:
             shape.by_beams, shape.held_along = True, 0.0
             shape.seed(R, t, FINE_SIGMA_M, draw)
         self.ranges = tuple(OwnRanges.of(shape.clouds) for shape in self.states)
+        self.channels = OwnChannels.of(self.states)
 
     def left_out(self, lines: CloudLinearisation) -> float:
         """Scale of the registration by a jackknife, at a linearisation."""
@@ -321,9 +325,13 @@ class _Loop:
         return replace(sizes, offset_m=min(sizes.offset_m, most_m))
 
     def directions(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
-        """(6 J, B) by biases of the ranges, and by what the gyroscope turned since the stamps."""
-        biases = shapes.biases.directions(self._sizes())
-        return np.hstack([biases, turned_clouds(self.state.problem, lines)])
+        """(6 J, B) by biases of ranges, by channels, and by turns of the gyroscope since stamps."""
+        every = [shapes.biases.directions(self._sizes())]
+        if self.channels is not None:
+            usual = range_errors(self.state.config.noise)
+            sizes = channel_sizes(self.channels.lidars, self.state.structure, usual)
+            every.append(self.channels.directions(self.states, shapes.poses, sizes))
+        return np.hstack([*every, turned_clouds(self.state.problem, lines)])
 
     def _applied(self, directions: Array) -> Array:
         """(B,) the offsets in sigmas, of all biases along `directions`."""

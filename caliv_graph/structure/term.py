@@ -17,7 +17,7 @@ from caliv_graph.config.range_errors import range_errors
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
 from caliv_graph.structure.align import align_patches
-from caliv_graph.structure.beams import beam_nodes
+from caliv_graph.structure.beams import CHANNEL_KINDS, beam_nodes, parts_of
 from caliv_graph.structure.elimination import factor_of, half_solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
@@ -278,7 +278,21 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         stance=stance,
         standing=None if tilt is None else standing,
         clocks=found.clocks,
+        channels=channel_sizes(found),
     )
+
+
+def channel_sizes(found: Solved) -> dict[str, tuple[float, float, float]]:
+    """LiDAR -> 1 sigma of range (m), elevation and azimuth (rad) of a channel, by the median one.
+
+    Of those of which structure estimated them.
+    """
+    names, beams = found.problem.patches.lidars, found.layout.beams
+    sizes = np.zeros((len(names), CHANNEL_KINDS))
+    for lidar, kind, own in parts_of(beams):
+        if kind < CHANNEL_KINDS:
+            sizes[lidar, kind] = float(np.median(found.nuisances.beams[own]))
+    return {name: (r, e, a) for name, (r, e, a) in zip(names, sizes.tolist(), strict=True) if r > 0}
 
 
 def term_of_odometry(

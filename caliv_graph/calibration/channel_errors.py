@@ -72,7 +72,8 @@ class OwnChannels:
     def of(cls, states: Sequence[JointRegistration]) -> OwnChannels:
         """Of the clouds of all placements."""
         names = [[cloud.lidar for cloud in state.observation.clouds] for state in states]
-        lidars = tuple(sorted({name for own in names for name in own}))
+        # As they first come: nothing hangs on names.
+        lidars = tuple(dict.fromkeys(name for own in names for name in own))
         index = [np.array([lidars.index(name) for name in own], dtype=np.int64) for own in names]
         of_point = [own[s.clouds.cloud] for own, s in zip(index, states, strict=True)]
         elevation = [elevations(state.clouds.points) for state in states]

@@ -313,9 +313,15 @@ class _Loop:
     def _reduced(self, clouds: tuple[Array, Array], lines: CloudLinearisation) -> Reduced:
         return reduce_to_extrinsics(self.state.problem, self.state.values, self.base, clouds, lines)
 
-    def linearised(self, shapes: _Shapes, lines: CloudLinearisation) -> Reduced:
-        """The graph with the clouds' quadratic; biases of ranges and turns eliminated."""
-        joint, directions = shapes.joint(self.state.scale), self.directions(shapes, lines)
+    def linearised(
+        self, shapes: _Shapes, lines: CloudLinearisation, directions: Array | None = None
+    ) -> Reduced:
+        """The graph with the clouds' quadratic; what moves them along `directions` eliminated.
+
+        None: these are worked out.
+        """
+        joint = shapes.joint(self.state.scale)
+        directions = self.directions(shapes, lines) if directions is None else directions
         return self._reduced(without_bias(*joint, directions, self._applied(directions)), lines)
 
     def _sizes(self) -> BiasSizes:
@@ -339,9 +345,8 @@ class _Loop:
         out[: len(self.offsets_m)] = self.offsets_m / self._sizes().offset_m
         return out
 
-    def _follow(self, shapes: _Shapes, reduced: Reduced, step: Array) -> None:
+    def _follow(self, shapes: _Shapes, reduced: Reduced, step: Array, directions: Array) -> None:
         """Moves the offsets to their most likely values after a step."""
-        directions = self.directions(shapes, reduced.lines)
         joint, applied = shapes.joint(self.state.scale), self._applied(directions)
         found = most_likely_biases(*joint, directions, applied, reduced.moved_clouds(step))
         self.offsets_m = self._sizes().offset_m * found[: len(self.offsets_m)]
@@ -357,11 +362,12 @@ class _Loop:
             self.fine += 1
             if self.fine == BIAS_AFTER:
                 self.estimate_bias(shapes, lines)
-        reduced = self.linearised(shapes, lines)
+        directions = self.directions(shapes, lines)
+        reduced = self.linearised(shapes, lines, directions)
         step, lost = self._step(reduced, number)
-        squared = self._squares(shapes, lines)
+        squared = self._squares(shapes, lines, directions)
         if self.fine >= BIAS_AFTER:
-            self._follow(shapes, reduced, step)
+            self._follow(shapes, reduced, step, directions)
         state.values = reduced.move(step)
         state.graph_seconds += time.perf_counter() - begun
         new = linearise_clouds(state.problem, state.values)
@@ -381,12 +387,18 @@ class _Loop:
             self.undetermined = lost
         return step, lost
 
-    def _squares(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
-        """(J,) squared residuals of the clouds, to weigh them by."""
+    def _squares(self, shapes: _Shapes, lines: CloudLinearisation, directions: Array) -> Array:
+        """(J,) squared residuals of the clouds, to weigh them by.
+
+        Their LiDAR's biases and channels are errors of each, too: what the graph leaves to these
+        is no sign of a cloud that lies wrong.
+        """
         state = self.state
         pull, information = _single_clouds(state, shapes)
         views = np.concatenate([shape.view_weights for shape in self.states])
-        single = information / views[:, None, None]
+        by = directions.reshape(len(views), 6, -1)
+        cov = np.linalg.inv(information / views[:, None, None]) + by @ np.swapaxes(by, 1, 2)
+        single = np.asarray(np.linalg.inv(cov), np.float64)
         return squares_without_own_pose(
             state.problem, lines, -pull, single, state.values, state.noise
         )

@@ -220,8 +220,6 @@ def _reduction(state: SolveState, registrations: Sequence[Registration]) -> Call
     """`reduced_registered` for values that move, weights and noise fixed."""
     problem, steady = state.problem, base_graph(state)
     H, measured = joint_information(state, registrations), measured_poses(registrations)[0]
-    if state.bias_directions is not None:
-        H = without_bias(H, np.zeros(len(H)), state.bias_directions)[0]
 
     def reduced() -> Reduced:
         lines = linearise_clouds(problem, state.values)
@@ -262,7 +260,10 @@ def step_of_all(state: SolveState) -> Callable[[Reduced], Array]:
 
 
 def joint_information(state: SolveState, registrations: Sequence[Registration]) -> Array:
-    """(6 J, 6 J) joint information of all registered poses, with robust weights."""
+    """(6 J, 6 J) joint information of all registered poses, with robust weights.
+
+    Biases of the ranges and errors of channels are eliminated, where they are known.
+    """
     turns = state.turns or [None] * len(registrations)
     out = []
     placements = state.problem.clouds_of_placements()
@@ -271,7 +272,10 @@ def joint_information(state: SolveState, registrations: Sequence[Registration]) 
         if turn is not None:
             H = marginalise_symmetry(H, np.zeros(len(H)), turn)[0]
         out.append(weighted_joint(H, state.weights.values[part]))
-    return np.asarray(block_diag(*out) / state.scale**2)
+    H = np.asarray(block_diag(*out) / state.scale**2)
+    if state.bias_directions is None:
+        return H
+    return without_bias(H, np.zeros(len(H)), state.bias_directions)[0]
 
 
 def measured_poses(

@@ -62,13 +62,13 @@ def of_sixteen(lidars: tuple[str, ...], drive: int = 0) -> JointRegistration:
 def summed(own: OwnChannels, state: JointRegistration, R: Array, t: Array, kind: int) -> Array:
     """(J, 6) by an error of 1 of all channels."""
     by = own.directions([state], [(R, t)], ALIKE) / own.part
-    return by[:, own.kind == kind].sum(axis=1).reshape(-1, 6)
+    return np.asarray(by[:, own.kind == kind].sum(axis=1).reshape(-1, 6))
 
 
 def turned_about_lidar(R: Array, t: Array, axes: Array) -> Array:
     """(J, 6) left perturbations of poses by turns of their LiDARs about axes (J, 3)."""
     turn = np.einsum("jab,jb->ja", R, axes)
-    return np.hstack([turn, np.cross(t, turn)])
+    return np.asarray(np.hstack([turn, np.cross(t, turn)]))
 
 
 def test_all_channels_together_turn_the_lidar_or_shift_its_clouds() -> None:

@@ -24,7 +24,7 @@ from caliv_graph.targets.cloud.beams import elevations
 KINDS = 3
 """Errors of a channel: its range (m), elevation and azimuth (rad)."""
 
-MOST_GROUPS = 16
+MOST_GROUPS = 8
 """Groups of neighbouring channels of a LiDAR, at most, whose mean errors are nuisances: a LiDAR
 with more has several channels to a group, and the mean of these errs less."""
 

@@ -31,6 +31,9 @@ with more has several channels to a group, and the mean of these errs less."""
 SHORT_M = 0.05
 """Height of a cloud below which it does not show how an error changes along it."""
 
+LEAST_COS = 1e-3
+"""Cosine of the elevation of a cloud below which it is straight above or below its LiDAR."""
+
 ChannelSizes = Mapping[str, tuple[float, float, float]]
 """LiDAR -> 1 sigma of the range (m), elevation and azimuth (rad) of a channel."""
 
@@ -54,11 +57,12 @@ class OwnChannels:
     """How errors of channels seem to move the clouds of all placements, in the lidar frames.
 
     Attributes:
-        moves: of each placement (J, 6, C): turn about the middle of a cloud, and motion of it, by
-            an error of 1 of each. The same C errors in all placements.
-        lidar: (C,) whose they are, index into `lidars`.
+        moves: of each placement (J, 6, C): turn about the middle of a cloud (rad) and motion of it
+            (m), lidar frame, by an error of 1 (m, rad) of each. The same C errors in all
+            placements, kind by kind.
+        lidar: (C,) the LiDAR of each, index into `lidars`.
         kind: (C,) range, elevation or azimuth.
-        part: (C,) 1 sigma of each in that of one channel: a group has several.
+        part: (C,) 1 sigma of each over that of one channel: a group has several.
         lidars: names.
     """
 
@@ -72,7 +76,7 @@ class OwnChannels:
     def of(cls, states: Sequence[JointRegistration]) -> OwnChannels:
         """Of the clouds of all placements."""
         names = [[cloud.lidar for cloud in state.observation.clouds] for state in states]
-        # As they first come: nothing hangs on names.
+        # In the order in which they first come: results must not depend on names.
         lidars = tuple(dict.fromkeys(name for own in names for name in own))
         index = [np.array([lidars.index(name) for name in own], dtype=np.int64) for own in names]
         of_point = [own[s.clouds.cloud] for own, s in zip(index, states, strict=True)]
@@ -82,11 +86,15 @@ class OwnChannels:
         for a in range(len(lidars)):
             some = np.concatenate([e[of == a] for e, of in zip(elevation, of_point, strict=True)])
             channels, groups = _groups(some)
-            for number, e, of in zip(group, elevation, of_point, strict=True):
-                number[of == a] = begin + groups[nearest_channels(channels, e[of == a])]
-            begin += int(groups.max()) + 1
-            owner.append(np.full(int(groups.max()) + 1, a))
-            parts.append(np.bincount(groups) ** -0.5)
+            shares = []
+            for state, number, e, of in zip(states, group, elevation, of_point, strict=True):
+                own = nearest_channels(channels, e[of == a])
+                number[of == a] = begin + groups[own]
+                shares.append(_shares(state.clouds.cloud[of == a], own, len(channels)))
+            part = _part_of_one(np.concatenate(shares), groups)
+            parts.append(part)
+            owner.append(np.full(len(part), a))
+            begin += len(part)
         moves = tuple(
             _moves(state.clouds, number, begin) for state, number in zip(states, group, strict=True)
         )
@@ -104,7 +112,7 @@ class OwnChannels:
         poses: Sequence[tuple[Array, Array]],
         sizes: ChannelSizes,
     ) -> Array:
-        """(6 J, C) left perturbations of the clouds' poses by errors of 1 sigma.
+        """(6 J, C) left perturbations by errors of 1 sigma of the poses of all J clouds.
 
         Args:
             states: the placements.
@@ -125,7 +133,7 @@ class OwnChannels:
 def _groups(elevation_rad: Array) -> tuple[Array, IntArray]:
     """Elevations of the channels of points (n,), ascending, and the group (k,) of each.
 
-    Where channels cannot be told apart, what is `CHANNELS_APART_RAD` apart is another one.
+    Where channels cannot be told apart, bins of `CHANNELS_APART_RAD` stand for them.
     """
     channels = found_channels(elevation_rad)
     if channels is None:
@@ -135,6 +143,27 @@ def _groups(elevation_rad: Array) -> tuple[Array, IntArray]:
     return channels, np.arange(len(channels)) * groups // len(channels)
 
 
+def _shares(cloud: IntArray, channel: IntArray, channels: int) -> Array:
+    """(j, k) share of each of k channels in the points of each of the j clouds that have some.
+
+    `cloud` (n,), ascending, and `channel` (n,) are those of the points.
+    """
+    clouds, number = np.unique(cloud, return_inverse=True)
+    key = number.ravel() * channels + channel
+    count = np.bincount(key, minlength=len(clouds) * channels).reshape(len(clouds), channels)
+    return np.asarray(count / np.maximum(count.sum(axis=1), 1)[:, None])
+
+
+def _part_of_one(shares: Array, groups: IntArray) -> Array:
+    """(g,) 1 sigma of the mean error of each group over that of a channel, by shares (j, k).
+
+    Clouds that are far away see fewer channels of a group: root mean square over clouds.
+    """
+    into = np.eye(int(groups.max()) + 1)[groups]
+    squares, whole = (shares**2 @ into).sum(axis=0), ((shares @ into) ** 2).sum(axis=0)
+    return np.asarray(np.sqrt(squares / np.maximum(whole, np.finfo(float).tiny)))
+
+
 def _moves(clouds: CloudStack, group: IntArray, groups: int) -> Array:
     """`OwnChannels.moves` of a placement, from the group (N,) of each point."""
     middle = clouds.centres
@@ -142,7 +171,9 @@ def _moves(clouds: CloudStack, group: IntArray, groups: int) -> Array:
     view = middle / far[:, None]
     level = cross(np.array([0.0, 0.0, 1.0]), view)
     across = np.linalg.norm(level, axis=1)  # cosine of the elevation
-    level /= np.maximum(across, 1e-6)[:, None]
+    # Straight above the LiDAR no direction is level before others: that to its left is taken.
+    level = np.where((across > LEAST_COS)[:, None], level, [0.0, 1.0, 0.0])
+    level /= np.linalg.norm(level, axis=1)[:, None]
     up = cross(view, level)
     height = np.einsum("na,na->n", clouds.centred, up[clouds.cloud])
     key = clouds.cloud * groups + group

@@ -390,13 +390,13 @@ class _Loop:
     def _squares(self, shapes: _Shapes, lines: CloudLinearisation, directions: Array) -> Array:
         """(J,) squared residuals of the clouds, to weigh them by.
 
-        Their LiDAR's biases and channels are errors of each, too: what the graph leaves to these
-        is no sign of a cloud that lies wrong.
+        Errors along `directions` are errors of each, too: what the graph leaves to them is no sign
+        of a cloud that lies wrong. Not the offsets of the ranges: clouds are moved back with these.
         """
         state = self.state
         pull, information = _single_clouds(state, shapes)
         views = np.concatenate([shape.view_weights for shape in self.states])
-        by = directions.reshape(len(views), 6, -1)
+        by = directions[:, len(self.offsets_m) :].reshape(len(views), 6, -1)
         cov = np.linalg.inv(information / views[:, None, None]) + by @ np.swapaxes(by, 1, 2)
         single = np.asarray(np.linalg.inv(cov), np.float64)
         return squares_without_own_pose(

@@ -91,7 +91,7 @@ def found_channels(elevation_rad: Array) -> Array | None:
         return None
     place = ((elevation_rad - elevation_rad.min()) / BIN_RAD).astype(np.int64)
     count = np.bincount(place)
-    density = np.convolve(count, np.ones(3), mode="same")
+    density = np.convolve(count, np.ones(3))[1:-1]
     near = round(NEAR_RAD / BIN_RAD)
     most = sliding_window_view(np.pad(density, near), 2 * near + 1).max(axis=1)
     inside = np.concatenate([[False], density > VALLEY * most, [False]])

@@ -49,7 +49,7 @@ from caliv_graph.structure.thinning import (
     with_scans,
 )
 from caliv_graph.structure.tilts import FIRST_TILT_PER_M, USUAL_RAD
-from caliv_graph.structure.weights import ground_weights, robust_weights
+from caliv_graph.structure.weights import bend_weights, ground_weights, robust_weights
 
 ROUGH_GATES_M = (0.3, 0.15, 0.08)
 GATES_M = (0.06, 0.06)
@@ -76,7 +76,9 @@ Clocks = dict[str, tuple[float, float]]
 class Estimate:
     """An estimate of a drive, its strips, and the noise at which it is to be linearised.
 
-    It is without the residuals, which take 70 MB and more: nobody keeps two.
+    It is without the residuals, which take 70 MB and more: nobody keeps two. `unbent` (K,) are the
+    smallest weights that strips had by their bends (`weights.bend_weights`) in this round: the bend
+    of a strip without weight is not estimated any more.
     """
 
     problem: Problem
@@ -86,6 +88,7 @@ class Estimate:
     weights: Array
     nuisances: Nuisances
     layout: Layout
+    unbent: Array
     converged: bool
 
     def levels(self) -> Levels:
@@ -436,7 +439,10 @@ def _round(
         turn_rad_s=problem.turn_rad_s,
     )
     weights = np.ones(sightings.count)
-    return Estimate(problem, state, strips, sightings, weights, nuisances, layout, converged=False)
+    unbent = np.ones(strips.count)
+    return Estimate(
+        problem, state, strips, sightings, weights, nuisances, layout, unbent, converged=False
+    )
 
 
 def _settled(
@@ -490,13 +496,13 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
         tilts,
     )
     by_offset = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
-    of_ground = ground_weights(
-        geometry, sightings, lidar, found.strips.level, state.errors, layout, nuisances
-    )
+    level = found.strips.level
+    unbent = np.minimum(found.unbent, bend_weights(state.errors, layout, nuisances, level))
+    of_ground = ground_weights(geometry, sightings, lidar, level) * unbent[sightings.strip]
     weights = np.minimum(by_offset, of_ground)
     step = d[layout.extrinsic : layout.error]
     cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
-    held.append(replace(after, weights=weights, nuisances=nuisances))
+    held.append(replace(after, weights=weights, nuisances=nuisances, unbent=unbent))
     return math.sqrt(float(step @ np.linalg.solve(cov, step)))
 
 

@@ -285,14 +285,14 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
 def channel_sizes(found: Solved) -> dict[str, tuple[float, float, float]]:
     """LiDAR -> 1 sigma of range (m), elevation and azimuth (rad) of a channel, by the median one.
 
-    Of those of which structure estimated them.
+    Of the LiDARs whose channels are seen; between elevations errors are not those of channels.
     """
-    names, beams = found.problem.patches.lidars, found.layout.beams
-    sizes = np.zeros((len(names), CHANNEL_KINDS))
-    for lidar, kind, own in parts_of(beams):
-        if kind < CHANNEL_KINDS:
-            sizes[lidar, kind] = float(np.median(found.nuisances.beams[own]))
-    return {name: (r, e, a) for name, (r, e, a) in zip(names, sizes.tolist(), strict=True) if r > 0}
+    out: dict[str, list[float]] = {}
+    for lidar, _, own in parts_of(found.layout.beams):
+        if found.layout.beams[lidar].kinds == CHANNEL_KINDS:
+            name = found.problem.patches.lidars[lidar]
+            out.setdefault(name, []).append(float(np.median(found.nuisances.beams[own])))
+    return {name: (r, e, a) for name, (r, e, a) in out.items()}
 
 
 def term_of_odometry(

@@ -30,38 +30,30 @@ of 450 to 660 strips is 4 to 7 (crowns, waves, a hill); strips over a kerb have 
 SCATTER_SPREADS: Spreads = (3.0, 6.0)
 """Of the variance of the points of a sighting of ground about its own plane, in medians."""
 
-LEAST_SCATTER = 0.01
-"""Smallest such median, in variances of the noise: points without noise are all alike."""
+LEAST_BEND_PER_M = 1e-3
+"""Smallest such median: half a millimetre over 2 m is no step on the flattest floor."""
+
+LEAST_SCATTER = 0.25
+"""Smallest median of that variance, in variances of the noise: where it is less, a sighting with
+the noise that was expected keeps its weight."""
 
 CHANCE = 3.0
 """Sigmas by which that variance is larger by chance where a sighting has few points."""
 
 
 def ground_weights(
-    geometry: Geometry,
-    sightings: Sightings,
-    lidar: IntArray,
-    level: BoolArray,
-    errors: Array,
-    layout: Layout,
-    nuisances: Nuisances,
+    geometry: Geometry, sightings: Sightings, lidar: IntArray, level: BoolArray
 ) -> Array:
-    """(Q,) weights of sightings of ground by whether they are of one flat piece of it.
-
-    Walls have all of theirs.
+    """(Q,) weights of sightings of ground by tilt and scatter; walls have all of theirs.
 
     Args:
         geometry: residuals.
         sightings: Q of them.
         lidar: (Q,) index of the LiDAR of each.
         level: (K,) the strips that are ground.
-        errors: (D,) estimated errors, bends among them.
-        layout: their coordinates.
-        nuisances: their sizes.
     """
-    by_bend = bend_weights(errors, layout, nuisances, level)[sightings.strip]
     by_scatter = scatter_weights(sightings, lidar, level)
-    return tilt_weights(geometry, sightings, level) * by_bend * by_scatter
+    return tilt_weights(geometry, sightings, level) * by_scatter
 
 
 def robust_weights(offsets_m: Array, sightings: Sightings, nuisances: Nuisances) -> Array:
@@ -90,7 +82,7 @@ def tilt_weights(geometry: Geometry, sightings: Sightings, level: BoolArray) -> 
 
 
 def bend_weights(errors: Array, layout: Layout, nuisances: Nuisances, level: BoolArray) -> Array:
-    """(K,) weights of strips by their bends: what bends far more than other ground is a step.
+    """(K,) weights of strips by their bends: ground that bends far more than the rest has a step.
 
     `errors` (D,) are at the coordinates of `layout`; `level` (K,) are the strips that are ground.
     """
@@ -100,7 +92,8 @@ def bend_weights(errors: Array, layout: Layout, nuisances: Nuisances, level: Boo
     along, twist, across = errors[layout.bend : layout.surface_error].reshape(BENDS, -1)[:, level]
     middle, half = 0.5 * (along + across), np.hypot(0.5 * (along - across), twist)
     most = np.abs(middle) + half  # the larger eigenvalue
-    out[level] = _falling(most / np.median(nuisances.bend[level]), BEND_SPREADS)
+    unit = max(float(np.median(nuisances.bend[level])), LEAST_BEND_PER_M)
+    out[level] = _falling(most / unit, BEND_SPREADS)
     return out
 
 
@@ -125,6 +118,6 @@ def scatter_weights(sightings: Sightings, lidar: IntArray, level: BoolArray) -> 
 
 
 def _falling(t: Array, spreads: Spreads) -> Array:
-    """Weights by numbers of sigmas."""
+    """(n,) weights by numbers of sigmas t (n,)."""
     low, high = spreads
     return np.clip((high - t) / (high - low), 0.0, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -16,9 +17,11 @@ from caliv_graph.calibration.channel_errors import (
     channel_sizes,
 )
 from caliv_graph.calibration.range_bias import without_bias
+from caliv_graph.config.model import StructureConfig
 from caliv_graph.config.range_errors import UNSTATED
 from caliv_graph.products import Array, StructureTerm, TargetCloud, TargetObservation
 from caliv_graph.registration.register import JointRegistration
+from tests.calibration.test_score_tests import eight, run_on
 from tests.registration.scenes import chair_scene, config_of, looking_at_target, matrices
 
 RANGE, ELEVATION, AZIMUTH = 0, 1, 2
@@ -143,6 +146,41 @@ def test_no_number_of_clouds_tells_the_yaw_better_than_the_channels_that_see_the
     estimate = yaw / (yaw @ yaw)  # of all clouds: H is alike in all directions
     sigma = np.sqrt(estimate @ np.linalg.inv(less) @ estimate)
     assert sigma == pytest.approx(3e-4 / 3**0.5, rel=0.05)
+
+
+def test_clouds_that_see_few_channels_of_a_group_have_more_of_their_errors() -> None:
+    """Twenty channels, two or three to a group: a cloud on two of them has not the mean of all."""
+    rows = np.linspace(-4.0, 4.0, 20)
+    T = looking_at_target(0.0, 8.0, 0.4)
+    clouds = tuple(
+        TargetCloud("front", 0, j, board(T, of), f"{j}.pcd")
+        for j, of in enumerate([rows, rows[9:11], rows[9:11], rows[9:11]])
+    )
+    state = JointRegistration(TargetObservation(0, "target", np.zeros(3), clouds), config_of())
+    own = OwnChannels.of([state])
+    assert len(own.part) == 3 * MOST_GROUPS
+    D = own.directions([state], [matrices([T] * 4)], {"front": (0.0, 0.0, 1.0)})
+    sideways = np.sqrt((D.reshape(4, 6, -1) ** 2).sum(axis=2))[:, 4] / 8.0
+    assert sideways[1] == pytest.approx(2**-0.5, rel=0.1)
+    assert 20**-0.5 < sideways[0] < 0.6 * sideways[1]  # of two groups more than its own
+
+
+def test_sigmas_of_a_calibration_have_the_errors_of_the_channels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By a target alone, from good poses: channels of 2 mrad are most of the yaw's."""
+    asked = eight().asked(structure=StructureConfig(use=False))
+    known = run_on(asked).calibration
+
+    def large(lidars: Sequence[str], *_: object) -> ChannelSizes:
+        return dict.fromkeys(lidars, (1e-3, 2e-3, 2e-3))
+
+    monkeypatch.setattr("caliv_graph.calibration.refine.channel_sizes", large)
+    unknown = run_on(asked).calibration
+    before, after = (float(np.sqrt(c.lidars["front"].cov[2, 2])) for c in (known, unknown))
+    # Ten channels or more see the chair.
+    assert 2e-3 / 40**0.5 < after < 2e-3 / 5**0.5
+    assert after > 1.2 * before
 
 
 def test_sizes_are_those_of_structure_where_it_tells_some() -> None:

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from caliv_graph.geometry.se3 import tangent_axes, vehicle_axes_difference
-from caliv_graph.products import Array
+from caliv_graph.products import Array, BoolArray
 from caliv_graph.structure.bends import BENDS, USUAL_PER_M, seen_bends
+from caliv_graph.structure.layout import Layout, Nuisances
+from caliv_graph.structure.solve import STEPS
+from caliv_graph.structure.weights import bend_weights
 from tests.structure.test_solve import NOISE, problem_of, solve
 from tests.structure.yards import figure_eight, yard
 
@@ -77,3 +80,30 @@ def test_flat_walls_bend_by_nothing_and_move_no_lidar() -> None:
         apart = vehicle_axes_difference(one, other)
         assert np.abs(apart[:3]).max() < 3e-5
         assert np.abs(apart[3:]).max() < 5e-4
+
+
+def test_a_strip_that_loses_its_weight_by_its_bend_stays_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its bend is not estimated any more, and comes out as zero: it must not come back for that.
+
+    Walls with bumps, limits at which some of them are beyond.
+    """
+    lost: list[set[int]] = []
+
+    def of_bends(errors: Array, layout: Layout, nuisances: Nuisances, _: BoolArray) -> Array:
+        found = bend_weights(errors, layout, nuisances, np.ones(layout.strips, bool))
+        lost.append(set(np.flatnonzero(found == 0.0).tolist()))
+        return found
+
+    monkeypatch.setattr("caliv_graph.structure.weights.LEAST_BEND_PER_M", 0.0)
+    monkeypatch.setattr("caliv_graph.structure.weights.BEND_SPREADS", (1.0, 1.3))
+    monkeypatch.setattr("caliv_graph.structure.solve.bend_weights", of_bends)
+    problem = problem_of(yard(), figure_eight(24), 3, replace(NOISE, bump_m=0.004))
+    found = solve(replace(problem, bent=True))
+    first, *others = lost[-STEPS[-1] :]
+    assert len(first) > 10
+    # Without memory they are lost after every second step.
+    assert not set().union(*others) & first
+    assert first <= set(np.flatnonzero(found.unbent == 0.0).tolist())
+    assert found.weights[np.isin(found.sightings.strip, list(first))].max() == 0.0

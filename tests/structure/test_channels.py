@@ -41,6 +41,14 @@ def test_channels_are_found_whatever_their_distances(
     np.testing.assert_allclose(np.degrees(found), channels_deg, atol=0.01)
 
 
+@pytest.mark.parametrize("wide_rad", [0.0, 3e-4, 5e-4])
+def test_a_single_channel_is_found(wide_rad: float) -> None:
+    """A target far away, or a planar LiDAR: all points within two bins."""
+    found = found_channels(0.01 + np.linspace(0.0, wide_rad, 40))
+    assert found is not None
+    np.testing.assert_allclose(found, [0.01 + 0.5 * wide_rad], atol=1e-9)
+
+
 def test_a_channel_with_a_tenth_of_the_points_of_its_neighbours_is_found() -> None:
     few = drawn(np.array([1.0]), count=400)
     found = found_channels(np.concatenate([drawn(np.array([0.0, 2.0]), count=8000), few]))

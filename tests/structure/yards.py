@@ -157,11 +157,8 @@ def draw_patches(
                     long = bias + channels[own_channel]
                     q_l *= (1.0 + (long + rng.standard_normal(n) * noise.range_m) / r)[:, None]
                     h = np.column_stack([q_l, np.ones(n)])
-                    seen_by, which = np.unique(own_channel, return_inverse=True)
-                    middles = np.radians(CHANNEL_DEG * (seen_by - 179.5))
-                    of_channels.append(
-                        PointChannels(middles, which).sums(q_l.T, np.zeros(n, np.int64))
-                    )
+                    if noise.channel_m:
+                        of_channels.append(_sums(own_channel, q_l))
                     c = q_l.mean(axis=0)
                     values, vectors = np.linalg.eigh((q_l - c).T @ (q_l - c) / n)
                     nu = vectors[:, 0]
@@ -184,6 +181,13 @@ def draw_patches(
         if noise.channel_m
         else None,
     )
+
+
+def _sums(channel: IntArray, points_lidar: Array) -> ChannelSums | None:
+    """Sums of the points (n, 3) of a patch, by their channels (n,)."""
+    seen_by, which = np.unique(channel, return_inverse=True)
+    middles = np.radians(CHANNEL_DEG * (seen_by - 179.5))
+    return PointChannels(middles, which).sums(points_lidar.T, np.zeros(len(channel), np.int64))
 
 
 def draw_prior(

@@ -44,7 +44,8 @@ def beams(rng: np.random.Generator, channels: int = 40, columns: int = 180) -> A
 class RoomDrive:
     """A recording without motion data; every point at its own time.
 
-    `walls` may be fewer; LiDARs are stamped 0.2 s apart, one `phase_s` after the others.
+    `walls` may be fewer; LiDARs are stamped 0.2 s apart, one `phase_s` after the others. Scans that
+    have been read are `kept`: every stage reads them anew.
     """
 
     mountings: Mapping[str, gtsam.Pose3]
@@ -52,6 +53,7 @@ class RoomDrive:
     walls: Sequence[tuple[float, float]] = WALLS
     phase_s: Mapping[str, float] = field(default_factory=dict)
     name: str = "room"
+    kept: dict[tuple[str, int], LidarScan] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def lidars(self) -> tuple[str, ...]:
@@ -65,7 +67,9 @@ class RoomDrive:
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         for stamp in self.scan_stamps_ns(lidar):
             if wanted is None or stamp in wanted:
-                yield self.scan(lidar, stamp)
+                if (lidar, stamp) not in self.kept:
+                    self.kept[lidar, stamp] = self.scan(lidar, stamp)
+                yield self.kept[lidar, stamp]
 
     def scan(self, lidar: str, stamp: int) -> LidarScan:
         rng = np.random.default_rng([stamp % 2**31, len(lidar)])

@@ -70,9 +70,12 @@ def test_an_arc_as_json() -> None:
 
 @pytest.fixture(scope="module")
 def suggested(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
-    """What `plan` says of the arc, and the suggestion that it writes."""
-    out = tmp_path_factory.mktemp("plan") / "suggested.yaml"
-    return plan(ARC, "--out", out), out
+    """What `plan` says of the arc at 4 Hz, in half the time, and the suggestion that it writes."""
+    folder = tmp_path_factory.mktemp("plan")
+    lidars = yaml.safe_load(ARC.read_text())["lidars"]
+    slow = {name: lidar | {"rate_hz": 4.0} for name, lidar in lidars.items()}
+    out = folder / "suggested.yaml"
+    return plan(changed(folder, lidars=slow), "--out", out), out
 
 
 def test_an_arc_in_words(suggested: tuple[Result, Path]) -> None:

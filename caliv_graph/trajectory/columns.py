@@ -15,7 +15,7 @@ from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate, TrajectoryGraph, build_graph, from_values
 from caliv_graph.trajectory.factors import position_residuals, velocity_residuals
-from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, log_so3
+from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.parameters import InputParameter
@@ -55,19 +55,19 @@ def parameter_columns(
     whites = {kind: _Whitening.of(graph, kind, values, starts) for kind in kinds}
     column = 0
     for parameter in parameters:
-        moving = sorted(parameter.kinds)
+        moving = [kind for kind in sorted(parameter.kinds) if whites[kind].factors]
         for k in range(parameter.size):
-            ahead, behind = (parameter.stepped(data, k, sign) for sign in (1.0, -1.0))
+            # One input after the other: its dead reckoning is that of all kinds.
+            after, before = (
+                {kind: residuals.of(kind, moved) for kind in moving}
+                for moved in (parameter.stepped(data, k, sign) for sign in (1.0, -1.0))
+            )
             for kind in moving:
                 white = whites[kind]
-                if not white.factors:
-                    continue
-                after, before = (residuals.of(kind, moved) for moved in (ahead, behind))
-                if not len(after) == len(before) == len(white.factors):
+                if not len(after[kind]) == len(before[kind]) == len(white.factors):
                     raise ValueError(f"{parameter.name}: moved by a step, it has other factors")
-                if len(after):
-                    change = (after - before) / (2.0 * parameter.steps[k])
-                    out[white.rows, column] = np.einsum("mij,mj->mi", white.roots, change)
+                change = (after[kind] - before[kind]) / (2.0 * parameter.steps[k])
+                out[white.rows, column] = np.einsum("mij,mj->mi", white.roots, change)
             column += 1
     return out
 
@@ -140,6 +140,7 @@ class _Residuals:
         """Of an input that has not been moved, and states as in `parameter_columns`."""
         self._data, self._nodes, self._states = data, nodes, states
         self._values, self._dropped = values, dropped
+        self._moved: tuple[Inertial, DeadReckoning] | None = None
 
     def of(self, kind: str, moved: SmootherInput) -> Array:
         """(m, d) residuals of the factors of a kind, in order, of a moved input."""
@@ -208,9 +209,13 @@ class _Residuals:
         return from_values(self._values, len(self._nodes), self._data)
 
     def _dead_of(self, moved: SmootherInput) -> DeadReckoning:
+        """Of an input; that of the last one whose samples had moved is kept."""
         if moved.inertial is self._data.inertial:
             return self._dead
-        return without_bias(moved.inertial, self._nodes, self._states)
+        if self._moved is None or self._moved[0] is not moved.inertial:
+            dead = without_bias(moved.inertial, self._nodes, self._states)
+            self._moved = moved.inertial, dead
+        return self._moved[1]
 
     def _of_positions(self, moved: SmootherInput) -> Array:
         kinds = frozenset({"gnss"})

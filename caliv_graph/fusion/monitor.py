@@ -241,13 +241,15 @@ def _most_significant(
         Its chi-square and length, the movement (6,) and its covariance (6, 6), lidar axes; None if
         no window exceeds the threshold.
     """
+    lengths = [scans for scans in WINDOWS if scans <= len(recent)]
+    if not lengths:
+        return None
+    sums = [np.cumsum(of, axis=0) for of in zip(*reversed(recent), strict=True)]
+    informations, pulls = (of[np.array(lengths) - 1] for of in sums)
+    # All windows at once: such a small system takes less time than a call.
+    means = np.linalg.solve(informations, pulls[..., None])[..., 0]
     best: tuple[float, int, Array, Array] | None = None
-    information, pull = np.zeros((DOF, DOF)), np.zeros(DOF)
-    for scans, (certainty, gradient) in enumerate(reversed(recent), start=1):
-        information, pull = information + certainty, pull + gradient
-        if scans not in WINDOWS:
-            continue
-        mean: Array = np.asarray(np.linalg.solve(information, pull), dtype=np.float64)
+    for scans, information, pull, mean in zip(lengths, informations, pulls, means, strict=True):
         chi2 = float(pull @ mean)
         if chi2 <= threshold or (best is not None and chi2 <= best[0]):
             continue

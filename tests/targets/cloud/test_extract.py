@@ -6,11 +6,12 @@ import math
 import re
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
@@ -62,9 +63,11 @@ class Scene:
 
     def of(self, name: str) -> set[tuple[float, ...]]:
         """The returns of one object."""
-        return {
-            tuple(p) for p, h in zip(self.points_lidar.tolist(), self.hit, strict=True) if h == name
-        }
+        return set(map(tuple, self.points_lidar[self._hit == name].tolist()))
+
+    @cached_property
+    def _hit(self) -> npt.NDArray[np.str_]:
+        return np.array(self.hit, np.str_)
 
 
 def scene(

@@ -51,14 +51,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS), metavar="NAME"
     )
-    parser.add_argument("--seeds", type=positive, default=1, help="seeds 1 to N (default: 1)")
+    parser.add_argument("--seeds", type=positive, default=1, help="how many (default: 1)")
+    parser.add_argument("--first", type=positive, default=1, help="the first seed (default: 1)")
     parser.add_argument("--off", type=effects_of, default=frozenset(), metavar="EFFECT,...")
     parser.add_argument("--keep", action="store_true", help="keep the bags")
     parser.add_argument("--out", type=Path, default=OUT, help="folder (default: out/foreign)")
     asked = parser.parse_args(arguments)
     import_open3d()  # with its shared libraries, for the simulator as well
     for name in asked.scenarios:
-        for seed in range(1, asked.seeds + 1):
+        for seed in range(asked.first, asked.first + asked.seeds):
             draws = Draws(name, seed, asked.off)
             print(text_of(draws, asked.out / f"{name}_{seed}", asked.keep), flush=True)
     return 0

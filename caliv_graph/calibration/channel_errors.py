@@ -15,7 +15,7 @@ import numpy as np
 
 from caliv_graph.config.range_errors import CHANNELS_APART_RAD, RangeErrors
 from caliv_graph.geometry.se3 import cross
-from caliv_graph.products import Array, IntArray, StructureTerm
+from caliv_graph.products import Array, IntArray
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.register import JointRegistration
 from caliv_graph.structure.channels import found_channels, nearest_channels
@@ -39,15 +39,15 @@ ChannelSizes = Mapping[str, tuple[float, float, float]]
 
 
 def channel_sizes(
-    lidars: Sequence[str], terms: Sequence[StructureTerm], usual: RangeErrors
+    lidars: Sequence[str], found: Sequence[ChannelSizes], usual: RangeErrors
 ) -> ChannelSizes:
-    """Sizes that structure found, root mean squares over drives; where it found none, `usual`."""
+    """Sizes that structure found in some drives, as root mean squares; where in none, `usual`."""
     out = {}
     for name in lidars:
-        found = [term.channels[name] for term in terms if name in term.channels]
+        own = [of_drive[name] for of_drive in found if name in of_drive]
         range_m, elevation_rad, azimuth_rad, *_ = usual.beams
-        if found:
-            range_m, elevation_rad, azimuth_rad = np.sqrt(np.square(found).mean(axis=0)).tolist()
+        if own:
+            range_m, elevation_rad, azimuth_rad = np.sqrt(np.square(own).mean(axis=0)).tolist()
         out[name] = (range_m, elevation_rad, azimuth_rad)
     return out
 

@@ -335,7 +335,8 @@ class _Loop:
         every = [shapes.biases.directions(self._sizes())]
         if self.channels is not None:
             usual = range_errors(self.state.config.noise)
-            sizes = channel_sizes(self.channels.lidars, self.state.structure, usual)
+            found = [term.channels for term in self.state.structure]
+            sizes = channel_sizes(self.channels.lidars, found, usual)
             every.append(self.channels.directions(self.states, shapes.poses, sizes))
         return np.hstack([*every, turned_clouds(self.state.problem, lines)])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 
 import gtsam
@@ -19,7 +18,7 @@ from caliv_graph.calibration.channel_errors import (
 from caliv_graph.calibration.range_bias import without_bias
 from caliv_graph.config.model import StructureConfig
 from caliv_graph.config.range_errors import UNSTATED
-from caliv_graph.products import Array, StructureTerm, TargetCloud, TargetObservation
+from caliv_graph.products import Array, TargetCloud, TargetObservation
 from caliv_graph.registration.register import JointRegistration
 from tests.calibration.test_score_tests import eight, run_on
 from tests.registration.scenes import chair_scene, config_of, looking_at_target, matrices
@@ -186,20 +185,7 @@ def test_sigmas_of_a_calibration_have_the_errors_of_the_channels(
 def test_sizes_are_those_of_structure_where_it_tells_some() -> None:
     usual = channel_sizes(("front", "rear"), (), UNSTATED)
     assert usual["front"] == usual["rear"] == UNSTATED.beams[:3]
-    term = StructureTerm(
-        drive=0,
-        stamps_ns=np.zeros(0, np.int64),
-        T_map_vehicle=(),
-        parameters={},
-        time_offsets_s={},
-        T_vehicle_lidar={},
-        information=np.zeros((0, 0)),
-        gradient=np.zeros(0),
-        strips=(),
-        offset_m=0.0,
-        channels={"rear": (3e-3, 1e-4, 2e-4)},
-    )
-    other = replace(term, channels={"rear": (4e-3, 1e-4, 0.0)})
-    sizes = channel_sizes(("front", "rear"), (term, other), UNSTATED)
+    found: list[ChannelSizes] = [{"rear": (3e-3, 1e-4, 2e-4)}, {"rear": (4e-3, 1e-4, 0.0)}]
+    sizes = channel_sizes(("front", "rear"), found, UNSTATED)
     assert sizes["front"] == usual["front"]
     np.testing.assert_allclose(sizes["rear"], [12.5e-6**0.5, 1e-4, 2e-4 / 2**0.5])

@@ -33,6 +33,9 @@ SCATTER_SPREADS: Spreads = (3.0, 6.0)
 LEAST_BEND_PER_M = 1e-3
 """Smallest such median: half a millimetre over 2 m is no step on the flattest floor."""
 
+DISTANCES, LEAST_SIGHTINGS = 8, 50
+"""Classes of distance in which these medians are taken, at most, and sightings of each at least."""
+
 LEAST_SCATTER = 0.25
 """Smallest median of that variance, in variances of the noise: where it is less, a sighting with
 the noise that was expected keeps its weight."""
@@ -100,7 +103,8 @@ def bend_weights(errors: Array, layout: Layout, nuisances: Nuisances, level: Boo
 def scatter_weights(sightings: Sightings, lidar: IntArray, level: BoolArray) -> Array:
     """(Q,) weights by how far the points of a sighting of ground are from their own plane.
 
-    In medians over all ground of the LiDAR; `lidar` (Q,) and `level` (K,) as in `ground_weights`.
+    In medians over the ground of the LiDAR that is about as far away: noise may grow with distance
+    and flat incidence. `lidar` (Q,) and `level` (K,) as in `ground_weights`.
     """
     out = np.ones(sightings.count)
     ground = np.flatnonzero(level[sightings.strip])
@@ -110,10 +114,13 @@ def scatter_weights(sightings: Sightings, lidar: IntArray, level: BoolArray) -> 
     square = np.linalg.eigvalsh(spread)[:, 0] / free
     low, high = SCATTER_SPREADS
     for i in np.unique(lidar[ground]).tolist():
-        own = lidar[ground] == i
-        times = square[own] / max(float(np.median(square[own])), LEAST_SCATTER)
-        chance = np.maximum(1.0, (1.0 + CHANCE * np.sqrt(2.0 / free[own])) / low)
-        out[ground[own]] = _falling(times / chance, (low, high))
+        of_lidar = np.flatnonzero(lidar[ground] == i)
+        by_distance = of_lidar[np.argsort(np.linalg.norm(middle[of_lidar], axis=1), kind="stable")]
+        parts = min(DISTANCES, max(1, len(of_lidar) // LEAST_SIGHTINGS))
+        for own in np.array_split(by_distance, parts):
+            times = square[own] / max(float(np.median(square[own])), LEAST_SCATTER)
+            chance = np.maximum(1.0, (1.0 + CHANCE * np.sqrt(2.0 / free[own])) / low)
+            out[ground[own]] = _falling(times / chance, (low, high))
     return out
 
 

@@ -18,11 +18,9 @@ from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array, IntArray
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.register import JointRegistration
+from caliv_graph.structure.beams import CHANNEL_KINDS
 from caliv_graph.structure.channels import found_channels, nearest_channels
 from caliv_graph.targets.cloud.beams import elevations
-
-KINDS = 3
-"""Errors of a channel: its range (m), elevation and azimuth (rad)."""
 
 MOST_GROUPS = 8
 """Groups of neighbouring channels of a LiDAR, at most, whose mean errors are nuisances: a LiDAR
@@ -100,9 +98,9 @@ class OwnChannels:
         )
         return cls(
             moves,
-            np.tile(np.concatenate(owner), KINDS),
-            np.repeat(np.arange(KINDS), begin),
-            np.tile(np.concatenate(parts), KINDS),
+            np.tile(np.concatenate(owner), CHANNEL_KINDS),
+            np.repeat(np.arange(CHANNEL_KINDS), begin),
+            np.tile(np.concatenate(parts), CHANNEL_KINDS),
             lidars,
         )
 
@@ -182,7 +180,7 @@ def _moves(clouds: CloudStack, group: IntArray, groups: int) -> Array:
     sums = np.bincount(key, height, clouds.count * groups).reshape(shape)
     spread = clouds.sum_per_cloud(height**2) + clouds.sizes * SHORT_M**2
     tilt = sums / spread[:, None]
-    out = np.zeros((clouds.count, 6, KINDS, groups))
+    out = np.zeros((clouds.count, 6, CHANNEL_KINDS, groups))
 
     def along(axes: Array, by: Array) -> Array:
         return np.asarray(axes[:, :, None] * by[:, None])
@@ -196,4 +194,4 @@ def _moves(clouds: CloudStack, group: IntArray, groups: int) -> Array:
     upright = np.tile([0.0, 0.0, 1.0], (clouds.count, 1))
     out[:, 3:, 2] = along(level, sideways * share)
     out[:, :3, 2] = along(upright, share) - along(view, sideways * tilt)
-    return out.reshape(clouds.count, 6, KINDS * groups)
+    return out.reshape(clouds.count, 6, CHANNEL_KINDS * groups)

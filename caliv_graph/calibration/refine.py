@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from caliv_graph.calibration.channel_errors import OwnChannels, channel_sizes
+from caliv_graph.calibration.channel_errors import ChannelSizes, OwnChannels, channel_sizes
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.jackknife import jackknife_scale
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
@@ -199,7 +199,11 @@ def _settled(
 ) -> tuple[_Loop, list[Iteration], bool]:
     """The loop at its end, its iterations, and whether it has converged; see `refined`."""
     none_m = np.zeros(sum(of.clouds.lidars for of in states))
-    loop = _Loop(state, states, base_graph(state), state.problem.guess_information(), none_m)
+    channels = OwnChannels.of(states)
+    found = [term.channels for term in state.structure]
+    sizes = channel_sizes(channels.lidars, found, range_errors(state.config.noise))
+    base, prior = base_graph(state), state.problem.guess_information()
+    loop = _Loop(state, states, base, prior, none_m, channels, sizes)
     loop.begin_shapes(normals=False)
     course: list[Iteration] = []
     converged = False
@@ -226,8 +230,8 @@ class _Loop:
 
     `prior` (6n, 6n) of the guesses; `offsets_m` (B,): biases of the ranges with which
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
-    once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement and
-    `channels` since the shapes began.
+    once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement since the
+    shapes began; `channels` that see the targets, and sizes of their errors.
     """
 
     state: SolveState
@@ -235,10 +239,11 @@ class _Loop:
     base: CalibrationGraph
     prior: Array
     offsets_m: Array
+    channels: OwnChannels
+    channel_sizes: ChannelSizes
     undetermined: int | None = None
     fine: int = 0
     ranges: tuple[OwnRanges, ...] = ()
-    channels: OwnChannels | None = None
 
     def expected(self) -> tuple[_Shapes, CloudLinearisation]:
         """E-step at the poses that the graph predicts, and the derivatives of these."""
@@ -286,7 +291,6 @@ class _Loop:
             shape.by_beams, shape.held_along = True, 0.0
             shape.seed(R, t, FINE_SIGMA_M, draw)
         self.ranges = tuple(OwnRanges.of(shape.clouds) for shape in self.states)
-        self.channels = OwnChannels.of(self.states)
 
     def left_out(self, lines: CloudLinearisation) -> float:
         """Scale of the registration by a jackknife, at a linearisation."""
@@ -332,13 +336,9 @@ class _Loop:
 
     def directions(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
         """(6 J, B) by biases of ranges, by channels, and by turns of the gyroscope since stamps."""
-        every = [shapes.biases.directions(self._sizes())]
-        if self.channels is not None:
-            usual = range_errors(self.state.config.noise)
-            found = [term.channels for term in self.state.structure]
-            sizes = channel_sizes(self.channels.lidars, found, usual)
-            every.append(self.channels.directions(self.states, shapes.poses, sizes))
-        return np.hstack([*every, turned_clouds(self.state.problem, lines)])
+        biases = shapes.biases.directions(self._sizes())
+        channels = self.channels.directions(self.states, shapes.poses, self.channel_sizes)
+        return np.hstack([biases, channels, turned_clouds(self.state.problem, lines)])
 
     def _applied(self, directions: Array) -> Array:
         """(B,) the offsets in sigmas, of all biases along `directions`."""

@@ -133,6 +133,7 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
         sighting_tilt=sighting * np.where(strips.level, *levels.tilt_per_m),
         strip=strip,
         strip_tilt=np.where(strips.level, *levels.strip_tilt_rad),
+        tilt_times=levels.tilt_times,
         bend=np.where(strips.level, *levels.bend_per_m),
     )
     weights = robust_weights(own, sightings, nuisances)
@@ -324,7 +325,11 @@ def _measured(
     group = groups_of(sightings, strips)
     repeated = problem.views.count[sightings.scan]
     same = alike(problem, sightings)
-    rows = whitened(geometry, sightings, group, repeated, same, other.nuisances, weights, layout)
+    lidar = problem.patches.scan_lidar[sightings.scan]
+    tilts = other.nuisances.tilts(sightings.strip, lidar, strips.level)
+    rows = whitened(
+        geometry, sightings, group, repeated, same, tilts, other.nuisances, weights, layout
+    )
     found = _Distances(other, rows)
     offsets, by_plane = geometry.offsets_m(sightings), geometry.plane_rows(sightings)
     thickness = thickness_m(by_plane, sightings, weights, offsets, strips.count)

@@ -9,7 +9,7 @@ import numpy as np
 
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import stack, tangent_axes
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import BeamErrors
 from caliv_graph.structure.bends import BENDS
 from caliv_graph.trajectory.imu import exp_so3
@@ -33,6 +33,8 @@ class Nuisances:
         sighting_tilt: (K,) tilt of each strip from scan to scan, rad; not metres.
         strip_tilt: (K,) tilt that a LiDAR sees each strip have in all scans against what others
             see, rad; not metres.
+        tilt_times: (L, 2) how much larger both tilts are of each LiDAR, on level strips and on
+            others; empty: of none.
         shared: offset of a surface from scan to scan, which its strips share: incidence, and how
             the beams fall, change along a wall slowly.
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
@@ -57,6 +59,18 @@ class Nuisances:
     bend: Array = field(default_factory=lambda: np.zeros(0))
     jitter_s: float = 0.0
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    tilt_times: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def tilts(self, strip: IntArray, lidar: IntArray, level: BoolArray) -> tuple[Array, Array]:
+        """(n,) `sighting_tilt` and `strip_tilt` of strips (n,) as LiDARs (n,) see them.
+
+        `level` (K,) are the strips that are ground.
+        """
+        own, repeated = self.sighting_tilt[strip], self.strip_tilt[strip]
+        if not len(self.tilt_times):
+            return own, repeated
+        times = self.tilt_times[lidar, np.where(level[strip], 0, 1)]
+        return own * times, repeated * times
 
 
 @dataclass(frozen=True)

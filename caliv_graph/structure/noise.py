@@ -196,17 +196,16 @@ def fitted_noise(
     sighting = np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2))
     if one or not tilts:
         per_m = first_tilts_per_m(level)
-        own_tilt, strip_tilt = sighting * per_m, strip * per_m
+        sizes = sighting * per_m, strip * per_m, nuisances.tilt_times
     else:
-        known = nuisances.sighting_tilt, nuisances.strip_tilt
-        own_tilt, strip_tilt = fitted_tilts(
-            sightings, geometry, lidar, weights, level, sighting, known
-        )
+        sizes = fitted_tilts(sightings, geometry, lidar, weights, level, sighting, nuisances)
+    own_tilt, strip_tilt, tilt_times = sizes
     return replace(
         nuisances,
         sighting=sighting,
         sighting_tilt=own_tilt,
         strip_tilt=strip_tilt,
+        tilt_times=tilt_times,
         shared=math.sqrt(shared),
         bias=_bias_sigma(asked, layout, nuisances.bias, errors, ranges),
         surface=_surface_sigma(asked, layout, nuisances.surface, errors, ranges.surface_m),

@@ -163,17 +163,27 @@ class DrivePatches:
         Metres, lidar frame as of the patch's own time. About the plane that fits the *ranges* best:
         directions of beams have no noise, so that it does not turn towards them.
         """
-        centres = self.centres_lidar
-        u = centres / np.maximum(np.linalg.norm(centres, axis=1), 1e-9)[:, None]
-        cov = self.moments[:, :3, :3] / self.points[:, None, None]
-        cov = cov - centres[:, :, None] * centres[:, None, :]
-        across = tangent_axes(u)
-        known = across @ cov @ np.swapaxes(across, 1, 2)
-        shape = known[:, 0, 0] * known[:, 1, 1] - known[:, 0, 1] * known[:, 1, 0]
-        squares = np.linalg.det(cov) / np.maximum(shape, SMALLEST_SHAPE_M4)
-        # Three degrees of freedom went into the plane; all points' noise is in the moments.
-        squares *= self.points**2 / np.maximum(self.points - 3.0, 1.0)
-        return np.asarray(u * np.sqrt(np.maximum(squares, 0.0))[:, None])
+        u, scatter_m = scatter_of_ranges(self.moments)
+        return np.asarray(u * (scatter_m * np.sqrt(self.points))[:, None])
+
+
+def scatter_of_ranges(moments: Array) -> tuple[Array, Array]:
+    """Directions (N, 3) of the beams of patches, and (N,) scatter of their ranges, metres.
+
+    About the plane that fits the *ranges* best: directions of beams have no noise. Unbiased.
+    `moments` (N, 4, 4) are about the LiDAR.
+    """
+    points = moments[:, 3, 3]
+    centres = moments[:, :3, 3] / points[:, None]
+    u = centres / np.maximum(np.linalg.norm(centres, axis=1), 1e-9)[:, None]
+    cov = moments[:, :3, :3] / points[:, None, None] - centres[:, :, None] * centres[:, None, :]
+    across = tangent_axes(u)
+    known = across @ cov @ np.swapaxes(across, 1, 2)
+    shape = known[:, 0, 0] * known[:, 1, 1] - known[:, 0, 1] * known[:, 1, 0]
+    squares = np.linalg.det(cov) / np.maximum(shape, SMALLEST_SHAPE_M4)
+    # Three degrees of freedom went into the plane; all points' noise is in the moments.
+    squares *= points / np.maximum(points - 3.0, 1.0)
+    return u, np.sqrt(np.maximum(squares, 0.0))
 
 
 SHORT_M = 0.05

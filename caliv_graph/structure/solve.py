@@ -106,6 +106,7 @@ class Estimate:
             bend_per_m=_medians(found.bend, level, (USUAL_PER_M, USUAL_PER_M)),
             tilt_per_m=_medians(tilt_per_m, level, FIRST_TILT_PER_M),
             strip_tilt_rad=_medians(found.strip_tilt, level, (USUAL_RAD, USUAL_RAD)),
+            tilt_times=found.tilt_times,
         )
 
     def stands(self) -> Stands:
@@ -124,12 +125,14 @@ class Sighted(Estimate):
     def rows(self) -> Rows:
         """The residuals in units of their noise."""
         problem, sightings = self.problem, self.sightings
+        lidar = problem.patches.scan_lidar[sightings.scan]
         return whitened(
             self.geometry,
             sightings,
             groups_of(sightings, self.strips),
             problem.views.count[sightings.scan],
             alike(problem, sightings),
+            self.nuisances.tilts(sightings.strip, lidar, self.strips.level),
             self.nuisances,
             self.weights,
             self.layout,
@@ -201,9 +204,9 @@ def _with_gradient(found: Sighted) -> tuple[Estimate, Array]:
 class Levels:
     """Noise levels, alike for all strips, with which a round begins: those of `Nuisances`.
 
-    `beams` is (E,), as of `Nuisances`, or None: as is usual. Pairs are of level strips, and of
-    others: `bend_per_m`, tilts of sightings in offsets (`tilt_per_m`), and what a LiDAR repeats of
-    tilts (`strip_tilt_rad`).
+    `beams` is (E,), as of `Nuisances`, or None: as is usual; `tilt_times` are as there. Pairs are
+    of level strips, and of others: `bend_per_m`, tilts of sightings in offsets (`tilt_per_m`), and
+    what a LiDAR repeats of tilts (`strip_tilt_rad`).
     """
 
     sighting_m: float
@@ -215,6 +218,7 @@ class Levels:
     beams: Array | None = None
     bend_per_m: Pair = (USUAL_PER_M, USUAL_PER_M)
     tilt_per_m: Pair = FIRST_TILT_PER_M
+    tilt_times: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @staticmethod
     def first(sighting_m: float, strip_m: float, shared_m: float, ranges: RangeErrors) -> Levels:
@@ -437,6 +441,7 @@ def _round(
         else levels.beams,
         bend=np.where(strips.level, *levels.bend_per_m),
         turn_rad_s=problem.turn_rad_s,
+        tilt_times=levels.tilt_times,
     )
     weights = np.ones(sightings.count)
     unbent = np.ones(strips.count)

@@ -13,6 +13,7 @@ import numpy as np
 
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.heavy_tails import heavy_tailed
+from caliv_graph.structure.layout import Nuisances
 from caliv_graph.structure.patches import along_axes
 from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings
@@ -39,6 +40,9 @@ STEEPEST_RAD = 1.0
 
 LEAST_TILTS = 20
 """Tilts, beyond those of the means, that tell the distance at least."""
+
+MOST_TIMES = 30.0
+"""How much larger the tilts of a LiDAR are than those of all LiDARs, at most."""
 
 ROUNDS = 20
 """Steps of the likelihood of the sizes, each of which costs next to nothing."""
@@ -79,9 +83,11 @@ def fitted_tilts(
     weights: Array,
     level: BoolArray,
     sighting_m: Array,
-    before: tuple[Array, Array],
-) -> tuple[Array, Array]:
+    before: Nuisances,
+) -> tuple[Array, Array, Array]:
     """1 sigma (K,) of the tilt of a sighting of each strip, and of what a LiDAR repeats of it, rad.
+
+    And (L, 2) how much larger both are of each LiDAR, on ground and on others (`_times`).
 
     The first in proportion to the sigma of the strip's offset: the scatter of the tilts of one
     LiDAR on one strip is as expected. The second by how far two LiDARs see a strip tilted against
@@ -96,17 +102,20 @@ def fitted_tilts(
         weights: (Q,) robust.
         level: (K,) which strips are ground.
         sighting_m: (K,) 1 sigma of the offset of each sighting.
-        before: both before.
+        before: all sizes before.
     """
-    own_rad, repeated = sighting_m * first_tilts_per_m(level), np.array(before[1])
+    own_rad, repeated = sighting_m * first_tilts_per_m(level), np.array(before.strip_tilt)
+    lidars = int(lidar.max(initial=0)) + 1
+    times = np.ones((max(lidars, len(before.tilt_times)), 2))
+    times[: len(before.tilt_times)] = before.tilt_times
     at = np.flatnonzero(weights > 0.5)
     if not len(at):
-        return own_rad, repeated
+        return own_rad, repeated, times
     tilts, variances = tilts_of(sightings, geometry, at)
     strip = sightings.strip[at]
-    total = variances + before[0][strip][:, None] ** 2
+    own_before, _ = before.tilts(strip, lidar[at], level)
+    total = variances + own_before[:, None] ** 2
     tilts, free = _without_turns(tilts, total, geometry, sightings.scan, at)
-    lidars = int(lidar.max(initial=0)) + 1
     key = strip * lidars + lidar[at]
     size = len(level) * lidars
     for of in (level, ~level):
@@ -126,7 +135,12 @@ def fitted_tilts(
         if of.any():
             told, tilt, share = (part.reshape(shape)[:, of] for part in (known, mean, left))
             repeated[of] = _repeated(told, tilt, share, repeated[of])
-    return own_rad, repeated
+    for kind, of in enumerate((level, ~level)):
+        own = of[strip]
+        sizes = own_rad[strip[own]], repeated[strip[own]]
+        part = tilts[own], variances[own], free[own]
+        times[:, kind] = _times(*part, strip[own], lidar[at][own], *sizes, times[:, kind])
+    return own_rad, repeated, times
 
 
 def _without_turns(
@@ -172,6 +186,72 @@ def _length(
             t += float(np.minimum(w * (tilts[:, i] - mean[number]) ** 2, 9.0).sum())
         low, high = (low, middle) if t > expected else (middle, high)
     return math.exp(0.5 * (low + high))
+
+
+def _times(
+    tilts: Array,
+    variances: Array,
+    free: Array,
+    strip: IntArray,
+    lidar: IntArray,
+    own_rad: Array,
+    repeated_rad: Array,
+    before: Array,
+) -> Array:
+    """(L,) how much larger the tilts of each LiDAR are than those of all, at least once.
+
+    The distances of its tilts from the mean of all LiDARs on the strip are as expected:
+    `E (t - m)^2 = v + f^2 (own^2 + repeated^2) - var(m)`. A LiDAR whose points on a strip lie on a
+    tenth of a metre, where others have two, shows the tilt of each bump. It is `before` where too
+    few tell.
+
+    Args:
+        tilts: (n, 2) of sightings, rad.
+        variances: (n, 2) of these by the noise of their points.
+        free: (n, 2) how much of each is left without the turns of scans.
+        strip: (n,) their strips.
+        lidar: (n,) their LiDARs.
+        own_rad: (n,) 1 sigma of the tilt of a sighting of the strip.
+        repeated_rad: (n,) 1 sigma of what a LiDAR repeats of it.
+        before: (L,) the times before.
+    """
+    lidars = len(before)
+    seen, number = np.unique(strip * lidars + lidar, return_inverse=True)
+    of_strip, place = np.unique(seen // lidars, return_inverse=True)
+    number, place = number.ravel(), place.ravel()
+    times = before[lidar]
+    own_size = np.hypot(own_rad, repeated_rad)
+    squares, less = np.zeros((2, len(tilts), 2))
+    for i in range(2):
+        w = 1.0 / (variances[:, i] + (times * own_rad) ** 2)
+        known = np.bincount(number, w, len(seen))
+        mean = np.bincount(number, w * tilts[:, i], len(seen)) / np.maximum(known, 1e-12)
+        shared = np.zeros(len(seen))
+        shared[number] = (times * repeated_rad) ** 2
+        of_lidar = 1.0 / (1.0 / np.maximum(known, 1e-12) + shared)
+        total = np.bincount(place, of_lidar, len(of_strip))
+        middle = np.bincount(place, of_lidar * mean, len(of_strip)) / total
+        squares[:, i] = (tilts[:, i] - middle[place[number]]) ** 2
+        less[:, i] = 1.0 / total[place[number]]
+    out = before.copy()
+    for k in range(lidars):
+        own = lidar == k
+        low, high = 0.0, math.log(MOST_TIMES)
+        for step in range(ROUNDS):
+            middle_times = math.exp(0.5 * (low + high)) if step else 1.0
+            all_of = variances[own] + (middle_times * own_size[own, None]) ** 2
+            share = free[own] * np.clip(1.0 - less[own] / all_of, 0.0, 1.0)
+            if not step and float(share.sum()) < LEAST_TILTS:
+                break
+            # Outliers count as three sigmas.
+            t = float(np.minimum(squares[own] / all_of, 9.0).sum())
+            if t > float(share.sum()):
+                low = math.log(middle_times)
+            else:
+                high = math.log(middle_times)
+        else:
+            out[k] = math.exp(low)
+    return out
 
 
 def _repeated(known: Array, mean: Array, left: Array, before: Array) -> Array:

@@ -136,6 +136,27 @@ def beside_a_kerb(kerb_m: float, seed: int) -> ScanPatches:
     return planar_patches(noisy(rays, ranges, seed), SIGMA_M)
 
 
+@pytest.mark.parametrize("width_deg", [0.5, 1.0])
+def test_a_line_of_points_that_noise_makes_wide_is_no_plane(width_deg: float) -> None:
+    """An arc of a rosette on the ground, 0.6 m below: 60 to 120 mm wide, ranges good to 14 mm.
+
+    As a patch it would be tilted by 7 and 3 degrees: its width is that of the noise.
+    """
+    assert not len(planar_patches(arc_on_ground(width_deg), SIGMA_M).time_s)
+    wide = planar_patches(arc_on_ground(4.0), SIGMA_M)
+    assert len(wide.time_s)
+    assert (wide.normal_lidar[:, 2] > np.cos(np.radians(2.0))).all()
+
+
+def arc_on_ground(width_deg: float) -> Array:
+    rng = np.random.default_rng(0)
+    azimuth = np.radians(np.linspace(20.0, 26.0, 300))
+    elevation = np.radians(-17.5 + width_deg * rng.uniform(-0.5, 0.5, 300))
+    flat = np.cos(elevation)
+    rays = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    return np.asarray(rays * (-0.6 / rays[:, 2] + rng.normal(0.0, 0.014, 300))[:, None])
+
+
 def test_what_stands_on_the_road_does_not_tilt_it() -> None:
     beside = []
     for seed in range(20):

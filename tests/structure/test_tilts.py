@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.layout import Nuisances
 from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.tilts import USUAL_RAD, fitted_tilts
@@ -15,13 +16,28 @@ FEW = 4
 OFFSET_M, OWN_RAD, REPEATED_RAD = 4e-4, 1.6e-3, 7e-4
 
 
+BEFORE = Nuisances(
+    bias=0.0,
+    incidence=0.0,
+    ground=0.0,
+    surface=0.0,
+    strip=np.zeros(STRIPS),
+    sighting=np.zeros(STRIPS),
+    sighting_tilt=np.full(STRIPS, 1e-3),
+    strip_tilt=np.full(STRIPS, 4e-4),
+    shared=0.0,
+    repeated=0.0,
+)
+
+
 def seen(
-    lidars: int, odd_rad: float = 0.0, turn_rad: float = 0.0
+    lidars: int, odd_rad: float = 0.0, turn_rad: float = 0.0, rougher: float = 1.0
 ) -> tuple[Sightings, Geometry, IntArray]:
     """Walls at x = 0, each with a tilt of its own that both LiDARs see; and the LiDARs.
 
     Points of 8 mm, as many as tell a tilt to 0.5 mrad. The first LiDAR sees the first wall
-    `odd_rad` more turned; every scan is turned by some `turn_rad`.
+    `odd_rad` more turned; every scan is turned by some `turn_rad`. Of the last LiDAR, which sees a
+    wall in a quarter of the scans then, tilts are `rougher` times those of the others.
     """
     rng = np.random.default_rng(11)
     strip = np.repeat(np.arange(STRIPS), lidars * SCANS)
@@ -29,7 +45,8 @@ def seen(
     of_strip = 5e-3 * rng.standard_normal((STRIPS, 2))
     of_lidar = REPEATED_RAD * rng.standard_normal((STRIPS, lidars, 2))
     of_lidar[0, 0] += odd_rad
-    tilt = of_strip[strip] + of_lidar[strip, lidar] + OWN_RAD * rng.standard_normal((len(strip), 2))
+    own = of_lidar[strip, lidar] + OWN_RAD * rng.standard_normal((len(strip), 2))
+    tilt = of_strip[strip] + np.where(lidar == lidars - 1, rougher, 1.0)[:, None] * own
     scan = np.tile(np.arange(lidars * SCANS), STRIPS)
     tilt += turn_rad * rng.standard_normal((lidars * SCANS, 2))[scan]
     y, z = (g.ravel() for g in np.meshgrid(np.linspace(-0.9, 0.9, 15), np.linspace(-0.9, 0.9, 15)))
@@ -48,35 +65,57 @@ def seen(
     return sightings, geometry, lidar
 
 
-def fitted(lidars: int, odd_rad: float = 0.0, turn_rad: float = 0.0) -> tuple[Array, Array]:
-    sightings, geometry, lidar = seen(lidars, odd_rad, turn_rad)
-    offset = np.full(STRIPS, OFFSET_M)
-    walls, before = np.zeros(STRIPS, np.bool_), (np.full(STRIPS, 1e-3), np.full(STRIPS, 4e-4))
-    weights = np.ones(sightings.count)
-    return fitted_tilts(sightings, geometry, lidar, weights, walls, offset, before)
+def fitted(
+    lidars: int, odd_rad: float = 0.0, turn_rad: float = 0.0, rougher: float = 1.0
+) -> tuple[Array, Array, Array]:
+    sightings, geometry, lidar = seen(lidars, odd_rad, turn_rad, rougher)
+    # The rough one is seen in fewer scans: the others say where a wall is.
+    weights = np.where((rougher > 1.0) & (lidar == lidars - 1) & (sightings.scan % 4 > 0), 0.0, 1.0)
+    return sizes_of(sightings, geometry, lidar, weights)
+
+
+def sizes_of(
+    sightings: Sightings, geometry: Geometry, lidar: IntArray, weights: Array
+) -> tuple[Array, Array, Array]:
+    offset, walls = np.full(STRIPS, OFFSET_M), np.zeros(STRIPS, np.bool_)
+    return fitted_tilts(sightings, geometry, lidar, weights, walls, offset, BEFORE)
+
+
+def test_a_lidar_that_sees_walls_rougher_has_larger_tilts_and_the_others_have_not() -> None:
+    """So do points on a tenth of a metre, where those of others are on two."""
+    own, repeated, times = fitted(3, rougher=4.0)
+    assert times[:2, 1] == pytest.approx(1.0, abs=0.1)
+    # The sizes of all have a part of it, so that the product is what counts.
+    size = times[2, 1] * np.median(np.hypot(own, repeated))
+    assert size == pytest.approx(4.0 * np.hypot(OWN_RAD, REPEATED_RAD), rel=0.15)
+
+
+def test_lidars_that_see_walls_alike_have_tilts_alike() -> None:
+    assert fitted(LIDARS)[2] == pytest.approx(1.0, abs=0.05)
+    assert fitted(1)[2] == pytest.approx(1.0, abs=0.05)
 
 
 def test_the_noise_of_tilts_and_what_lidars_repeat_are_told_apart() -> None:
-    own, repeated = fitted(LIDARS)
+    own, repeated, _ = fitted(LIDARS)
     assert own == pytest.approx(OWN_RAD, rel=0.05)
     assert np.sqrt(np.mean(repeated**2)) == pytest.approx(REPEATED_RAD, rel=0.15)
 
 
 def test_a_wall_that_two_lidars_see_tilted_against_each_other_has_a_size_of_its_own() -> None:
-    _, repeated = fitted(LIDARS, odd_rad=0.01)
+    _, repeated, _ = fitted(LIDARS, odd_rad=0.01)
     assert repeated[0] > 3e-3
     assert np.median(repeated[1:]) == pytest.approx(REPEATED_RAD, rel=0.25)
 
 
 def test_turns_of_whole_scans_are_no_tilts_of_walls() -> None:
     """A clock that is late turns all walls of a scan alike: it must not pass for their noise."""
-    own, repeated = fitted(LIDARS, turn_rad=6e-3)
+    own, repeated, _ = fitted(LIDARS, turn_rad=6e-3)
     assert own == pytest.approx(OWN_RAD, rel=0.05)
     assert np.sqrt(np.mean(repeated**2)) == pytest.approx(REPEATED_RAD, rel=0.15)
 
 
 def test_one_lidar_alone_does_not_tell_what_it_repeats() -> None:
-    own, repeated = fitted(1)
+    own, repeated, _ = fitted(1)
     assert own == pytest.approx(OWN_RAD, rel=0.05)
     assert repeated == pytest.approx(USUAL_RAD)
 
@@ -97,9 +136,7 @@ def test_robust_weights_count() -> None:
         sightings.points,
         (),
     )
-    offset, walls = np.full(STRIPS, OFFSET_M), np.zeros(STRIPS, np.bool_)
-    before = np.full(STRIPS, 1e-3), np.full(STRIPS, 4e-4)
-    own, _ = fitted_tilts(bent, geometry, lidar, weights, walls, offset, before)
+    own, *_ = sizes_of(bent, geometry, lidar, weights)
     assert own == pytest.approx(OWN_RAD, rel=0.05)
 
 
@@ -107,8 +144,5 @@ def test_scans_of_few_strips_say_less_of_what_is_repeated() -> None:
     """The turn of each scan takes a part of the tilts of its four strips with it."""
     sightings, geometry, lidar = seen(LIDARS)
     few = replace(sightings, scan=sightings.scan + 1000 * (sightings.strip // FEW))
-    before = np.full(STRIPS, 1e-3), np.full(STRIPS, 4e-4)
-    walls, weights = np.zeros(STRIPS, np.bool_), np.ones(sightings.count)
-    offset = np.full(STRIPS, OFFSET_M)
-    _, repeated = fitted_tilts(few, geometry, lidar, weights, walls, offset, before)
+    _, repeated, _ = sizes_of(few, geometry, lidar, np.ones(sightings.count))
     assert np.sqrt(np.mean(repeated**2)) == pytest.approx(REPEATED_RAD, rel=0.2)

@@ -136,7 +136,7 @@ class SeenBeams:
     by: Array
     turning: Array
 
-    def only(self, keep: IntArray | BoolArray) -> SeenBeams:
+    def only(self, keep: IntArray | BoolArray | slice) -> SeenBeams:
         """Those of some sightings."""
         return SeenBeams(self.column[keep], self.by[keep], self.turning[keep])
 

@@ -20,7 +20,7 @@ from caliv_graph.structure.beams import BeamNodes, beam_groups
 from caliv_graph.structure.layout import Layout, State
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.residuals import Geometry, geometry_of, lidar_poses
+from caliv_graph.structure.residuals import Geometry, geometry_of, joined, lidar_poses
 from caliv_graph.structure.sightings import Sightings, moved_moments, sightings_of
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import Strips
@@ -30,6 +30,10 @@ from caliv_graph.trajectory.select import VehicleTrajectory
 
 OFFSET_SIGMA_S = 0.05
 """1 sigma of a time offset: half a revolution at 10 Hz."""
+
+TOGETHER = 2048
+"""Sightings whose residuals are made at a time: what they are made of takes twice as much memory as
+they do."""
 
 SAME_TIME_NS = 200_000
 """Times of patches this near have one pose: 0.1 ms at most from their own, 0.2 mm at 2 m/s."""
@@ -252,18 +256,25 @@ def geometry_at(
     problem: Problem, state: State, sightings: Sightings, layout: Layout, dents: bool = True
 ) -> Geometry:
     """Residuals of the sightings at an estimate."""
-    scan = sightings.scan
-    return geometry_of(
-        state,
-        sightings,
-        layout,
-        problem.patches.scan_lidar[scan],
-        problem.pose_of_scan[scan],
-        problem.twists,
-        dents,
-        problem.turn_of_scan[scan],
-        problem.accelerations,
-    )
+    turn_of_scan = problem.turn_of_scan
+
+    def of(some: Sightings) -> Geometry:
+        return geometry_of(
+            state,
+            some,
+            layout,
+            problem.patches.scan_lidar[some.scan],
+            problem.pose_of_scan[some.scan],
+            problem.twists,
+            dents,
+            turn_of_scan[some.scan],
+            problem.accelerations,
+        )
+
+    if sightings.count <= TOGETHER:
+        return of(sightings)
+    starts = range(0, sightings.count, TOGETHER)
+    return joined((of(sightings.only(slice(i, i + TOGETHER))) for i in starts), sightings)
 
 
 def with_hold(problem: Problem, state: State, system: System) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -27,6 +27,9 @@ bonnet, is a surface of its own."""
 
 PLANE_ROWS = slice(12, 15)
 """Where the derivatives by the plane are in `Geometry.by`: after pose and extrinsic."""
+
+BEAM_ROWS = 20
+"""Where those by errors of the beams begin: after the plane and five errors of the LiDAR."""
 
 
 @dataclass(frozen=True)
@@ -250,13 +253,11 @@ def geometry_of(
         own = layout.turn + 3 * turn[:, None] + np.arange(3)
         by_turn_rate = sightings.time_s[:, None, None] * by_pose[:, :3]
         moved.append((by_turn_rate, own, state.errors[own]))
-    beams, of_beams_by = sightings.beams, slice(0)
+    beams = sightings.beams
     if beams is not None:
         beams = beams.turned(by_extrinsic[:, 2])
         own = layout.beam + beams.column
         of_beams += np.einsum("qc,qci->qi", state.errors[own], beams.by)
-        begin = sum(part.shape[1] for part in parts)
-        of_beams_by = slice(begin, begin + own.shape[1])
         parts.append(beams.by)
         columns.append(own)
     if layout.bent:
@@ -268,10 +269,34 @@ def geometry_of(
         parts.append(by)
         columns.append(own)
     by, column = np.concatenate(parts, axis=1), np.concatenate(columns, axis=1)
-    if beams is not None:
-        # No second copy: of many channels it is half of all.
-        beams = replace(beams, by=by[:, of_beams_by])
-    return Geometry(plain + of_beams, plain, by, column, m, beams)
+    return Geometry(plain + of_beams, plain, by, column, m, _beams_within(sightings, by))
+
+
+def joined(parts: Iterable[Geometry], sightings: Sightings) -> Geometry:
+    """The residuals of all sightings, from those of some at a time, in their order."""
+    whole: list[Array] = []
+    begin = 0
+    for part in parts:
+        some = [part.plain, part.placed, part.by, part.columns, part.normals_lidar]
+        whole = whole or [np.empty((sightings.count, *of.shape[1:]), of.dtype) for of in some]
+        own = slice(begin, begin + len(part.plain))
+        for to, of in zip(whole, some, strict=True):
+            to[own] = of
+        begin = own.stop
+    plain, placed, by, columns, normals_lidar = whole
+    beams = _beams_within(sightings, by)
+    return Geometry(plain, placed, by, np.asarray(columns, np.int64), normals_lidar, beams)
+
+
+def _beams_within(sightings: Sightings, by: Array) -> SeenBeams | None:
+    """What errors of the beams do, within all derivatives.
+
+    No second copy: of many channels it is half of all.
+    """
+    beams = sightings.beams
+    if beams is None:
+        return None
+    return replace(beams, by=by[:, BEAM_ROWS : BEAM_ROWS + beams.column.shape[1]])
 
 
 def _by_compensation(time_s: Array, twists_lidar: Array, by_extrinsic: Array) -> Array:

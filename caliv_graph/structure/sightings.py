@@ -63,8 +63,8 @@ class Sightings:
         """(Q, 3) weighted mean of the points."""
         return self.moments[:, :3, 3] / self.moments[:, 3, 3, None]
 
-    def only(self, keep: IntArray | BoolArray) -> Sightings:
-        """Those of a mask or of indices."""
+    def only(self, keep: IntArray | BoolArray | slice) -> Sightings:
+        """Those of a mask or of indices; of a slice without copies."""
         return replace(
             self,
             scan=self.scan[keep],

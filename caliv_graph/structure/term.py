@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -103,14 +104,17 @@ def structure_terms(
         # What the aligning and the solve leave behind in pieces would come on top of what follows.
         give_back_freed_memory()
         found = solve_structure(problem, start)
+        del problem
         if found is None:
             continue
         give_back_freed_memory()
         own_odometry = odometry_of([trajectory])
+        handed = [found]
+        del found
         if own_odometry is None:
-            out.append(term_of(found, places))
+            out.append(term_of(handed.pop(), places))
         else:
-            out.append(term_of_odometry(found, places, own_odometry, config))
+            out.append(term_of_odometry(handed.pop(), places, own_odometry, config))
     return tuple(out)
 
 
@@ -225,7 +229,8 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     """The quadratic on the poses `kept` (m,), parameters, time offsets and extrinsics.
 
     The marginal of motion data and structure together, less that of the motion data alone, which
-    are in the calibration's graph already.
+    are in the calibration's graph already. It lets go of `found` when it has what it needs of it:
+    the matrices that follow are as large.
     """
     layout, system, prior = found.layout, found.system, found.problem.prior
     strips = strips_of(found)  # before the matrices below: it takes as much as they do
@@ -239,46 +244,50 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     stand = np.arange(layout.standing, layout.standing + STANDING)
     tilt = mean_tilt(found)
     of_tilt = np.zeros((0, len(system.H))) if tilt is None else tilt.rows
+    state, names = found.state, found.problem.patches.lidars
+    term = partial(
+        StructureTerm,
+        drive=found.problem.patches.drive,
+        stamps_ns=prior.stamps_ns[kept],
+        T_map_vehicle=unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept]),
+        parameters=_parameters(found),
+        time_offsets_s={names[i]: float(state.offsets_s[i]) for i in layout.offsets},
+        T_vehicle_lidar=dict(zip(names, state.T_vehicle_lidar, strict=True)),
+        strips=strips,
+        offset_m=float(np.median(found.nuisances.sighting)),
+        ground=lidars_with_ground(found),
+        clocks=found.clocks,
+        channels=channel_sizes(found),
+    )
+    stated = found.problem.standing
+    known, offset = prior.parameter_information, prior.parameter_offset
+    b, held = system.b, [system.H]
+    del found, system, prior
     give_back_freed_memory()
     both, both_gradient, rows, cov = _marginal(
-        system.H, system.b, np.concatenate([keep, stand]), of_tilt
+        held.pop(), b, np.concatenate([keep, stand]), of_tilt
     )
     own = np.arange(len(poses), len(of_motion))
     _to_perturbations(motion, motion_gradient, own, by_now)
     # The graph of the calibration has the priors of the parameters.
-    both[np.ix_(own, own)] -= prior.parameter_information
-    moved = prior.parameter_offset + found.state.moved[parameters]
-    both_gradient[own] += prior.parameter_information @ moved
+    both[np.ix_(own, own)] -= known
+    both_gradient[own] += known @ (offset + state.moved[parameters])
     _to_perturbations(both, both_gradient, own, by_now)
     rows[:, own] = rows[:, own] @ by_now
     if tilt is not None:
         tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
-    now = found.state.errors[stand]
-    stance = stance_of(found.problem.standing, float(now[0]), both, both_gradient, tilt)
-    standing = standing_errors(found.problem.standing, now, both, both_gradient)
+    now = state.errors[stand]
+    stance = stance_of(stated, float(now[0]), both, both_gradient, tilt)
+    standing = standing_errors(stated, now, both, both_gradient)
     information, gradient, *_ = _marginal(both, both_gradient, np.arange(len(keep)))
     own_part = slice(0, len(of_motion))
     information[own_part, own_part] -= motion
     gradient[own_part] -= motion_gradient
-    state, names = found.state, found.problem.patches.lidars
-    T_map_vehicle = unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept])
-    offsets = {names[i]: float(state.offsets_s[i]) for i in layout.offsets}
-    return StructureTerm(
-        drive=found.problem.patches.drive,
-        stamps_ns=prior.stamps_ns[kept],
-        T_map_vehicle=T_map_vehicle,
-        parameters=_parameters(found),
-        time_offsets_s=offsets,
-        T_vehicle_lidar=dict(zip(names, state.T_vehicle_lidar, strict=True)),
+    return term(
         information=information,
         gradient=gradient,
-        strips=strips,
-        offset_m=float(np.median(found.nuisances.sighting)),
-        ground=lidars_with_ground(found),
         stance=stance,
         standing=None if tilt is None else standing,
-        clocks=found.clocks,
-        channels=channel_sizes(found),
     )
 
 
@@ -341,7 +350,8 @@ def _marginal(
     """The quadratic with all coordinates but `keep` (k,) eliminated, and rows (r, D) on `keep`.
 
     Information (k, k) and gradient (k,); the rows (r, k + 1), the rest following `keep`, what they
-    are at its zero last; and their covariance (r, r) by the rest, `keep` being known.
+    are at its zero last; and their covariance (r, r) by the rest, `keep` being known. It lets go of
+    H when it has its parts.
     """
     rest = np.ones(len(H), dtype=bool)
     rest[keep] = False
@@ -352,7 +362,9 @@ def _marginal(
         on_zero = np.column_stack([on_keep, np.zeros(len(rows))])
         return inside.copy(), b[keep].copy(), on_zero, np.zeros((len(rows), len(rows)))
     right = np.column_stack([H[np.ix_(keep, rest)].T, b[rest], on_rest.T])
-    half = half_solved(factor_of(H[np.ix_(rest, rest)], overwrite=True), right)
+    of_rest = [H[np.ix_(rest, rest)]]
+    del H
+    half = half_solved(factor_of(of_rest.pop(), overwrite=True), right)
     known = half.T @ half
     k = len(keep)
     information = inside - known[:k, :k]

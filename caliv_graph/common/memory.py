@@ -37,6 +37,11 @@ def give_back_freed_memory() -> None:
     keep all of it. A full collection lets go of them.
     """
     gc.collect()
+    give_back_freed_arrays()
+
+
+def give_back_freed_arrays() -> None:
+    """The same without what small objects left behind: within a stage, for a tenth of the time."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
     except (AttributeError, OSError, TypeError):

@@ -10,7 +10,7 @@ from functools import cached_property, partial
 import gtsam
 import numpy as np
 
-from caliv_graph.common.memory import give_back_freed_memory
+from caliv_graph.common.memory import give_back_freed_arrays, give_back_freed_memory
 from caliv_graph.config.range_errors import RangeErrors
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import usual_sigmas
@@ -182,6 +182,7 @@ def _linearised(held: list[Sighted]) -> System:
     before = held.pop()
     rows, found = [before.rows()], without_residuals(before)
     del before
+    give_back_freed_arrays()
     return system_of(  # it lets go of the rows, which nobody else may hold
         rows.pop(),
         found.state,
@@ -480,6 +481,7 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
     held.clear()
     factor, b = _factor(found, system)
     d = system.surfaces.follow(solved(factor, b))
+    give_back_freed_arrays()
     after = with_residuals(replace(found, state=stepped(found.state, layout, d)))
     geometry, state = after.geometry, after.state
     lidar = problem.patches.scan_lidar[sightings.scan]

@@ -12,9 +12,12 @@ import pytest
 
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, StructureTerm
+from caliv_graph.structure import problem as problems
 from caliv_graph.structure import solve as solving
+from caliv_graph.structure import term as terms
 from caliv_graph.structure import thickness
 from caliv_graph.structure.beams import beam_nodes
+from caliv_graph.structure.elimination import factor_of
 from caliv_graph.structure.noise import ONE_VIEW_M, range_sigmas
 from caliv_graph.structure.problem import Problem, geometry_at, part_of
 from caliv_graph.structure.residuals import Geometry
@@ -317,3 +320,40 @@ def test_one_estimate_at_a_time_has_residuals_and_none_while_surfaces_are_elimin
     assert not any(of() for of in made)
     assert found.layout.beams
     assert len(made) >= len(systems) > 8
+
+
+def test_residuals_of_some_sightings_at_a_time_are_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = problem_of(yard(), figure_eight(12), 1)
+    problem = replace(problem, beam_nodes=beam_nodes(problem.patches))
+    found = solve(problem)
+    of = found.problem, found.state, found.sightings, found.layout
+    whole = geometry_at(*of)
+    monkeypatch.setattr(problems, "TOGETHER", 7)
+    parts = geometry_at(*of)
+    assert parts.beams is not None
+    assert whole.beams is not None
+    assert np.shares_memory(parts.beams.by, parts.by)
+    for name in ("plain", "placed", "by", "columns", "normals_lidar"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+    for name in ("by", "column", "turning"):
+        np.testing.assert_array_equal(getattr(parts.beams, name), getattr(whole.beams, name))
+
+
+def test_a_term_lets_go_of_the_solve_before_it_eliminates(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What it eliminates is as large as the system."""
+    handed = [solve(problem_of(yard(), figure_eight(12), 1))]
+    left = weakref.ref(handed[0]), weakref.ref(handed[0].system.H)
+    alive: list[bool] = []
+
+    def factor(H: Array, overwrite: bool = False) -> tuple[Array, Array]:
+        alive.append(any(of() is not None for of in left))
+        return factor_of(H, overwrite)
+
+    monkeypatch.setattr(terms, "factor_of", factor)
+    term_of(handed.pop(), np.arange(12))
+    assert alive
+    assert not any(alive)

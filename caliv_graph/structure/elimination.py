@@ -15,6 +15,7 @@ import scipy.linalg
 import scipy.sparse
 
 from caliv_graph.common.cores import share_out, shared_map
+from caliv_graph.common.memory import give_back_freed_arrays
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, IntArray
 
@@ -113,6 +114,7 @@ def eliminated(
     """
     V_rest = V[:rest]
     out = (H[:rest, :rest] - V_rest @ V_rest.T).toarray()
+    give_back_freed_arrays()  # of the products of sparse matrices
     order = np.concatenate(blocks) if len(blocks) else np.zeros(0, dtype=np.int64)
     rows, V_own, V_columns = H[order], V[order], V_rest.T.tocsr()
     del H, V, V_rest

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import nnls
 
+from caliv_graph.common.memory import give_back_freed_arrays
 from caliv_graph.config.range_errors import RangeErrors, SizePrior, log_normal, size_weights
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import BeamErrors, mean_rows, parts_of
@@ -368,6 +369,7 @@ def _beam_sigmas(
     if not len(before):
         return before
     own = np.arange(layout.beam, layout.standing)
+    give_back_freed_arrays()  # of the other noise levels
     known = np.linalg.inv(covariance(own))
     J, _ = mean_rows(layout.beams, 0, errors[own])
     mean = (J.T @ J).toarray()

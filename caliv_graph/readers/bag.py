@@ -13,6 +13,7 @@ import weakref
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -221,30 +222,11 @@ class Bag:
         return Header(seconds * NANOSECONDS_PER_SECOND + nanoseconds, frame_id)
 
     def _typestore(self, type_name: str) -> Typestore:
-        """Types of a topic: as the bag defines them, else as the current ROS does."""
-        definition = self._definitions[type_name]
-        store = get_typestore(Stores.EMPTY)
-        # A standard type does not need its definition: a damaged one is ignored.
-        with suppress(Exception):
-            if definition.format == MessageDefinitionFormat.MSG:
-                store.register(get_types_from_msg(definition.data, type_name))
-            elif definition.format == MessageDefinitionFormat.IDL:
-                # One file, or all that it needs: for each a rule, `IDL: its name`, and the file.
-                for part in filter(None, definition.data.split(f"{'=' * 80}\n")):
-                    named = part.startswith("IDL: ")
-                    store.register(get_types_from_idl(part.partition("\n")[2] if named else part))
-        standard = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
-        if type_name in store.fielddefs and _has_all_fields(store, standard):
-            return store
-        if type_name in standard.fielddefs:
-            return standard
-        if type_name in DEFINITIONS:
-            store = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
-            for name, text in DEFINITIONS.items():
-                store.register(get_types_from_msg(text, name))
-            return store
-        what = f"{self._path}: holds no definition of the type {type_name}"
-        raise RecordingError(what, "Record it with its package sourced, or as another type")
+        store = _typestore(self._definitions[type_name], type_name, self._is_ros1)
+        if store is None:
+            what = f"{self._path}: holds no definition of the type {type_name}"
+            raise RecordingError(what, "Record it with its package sourced, or as another type")
+        return store
 
     @contextmanager
     def _readers(self) -> Iterator[list[_Reader]]:
@@ -323,6 +305,40 @@ def _check_time(record_ns: Any) -> None:
     """Raises ValueError if a record time is not a time, or so late that differences overflow."""
     if not isinstance(record_ns, int) or not 0 <= record_ns < _LATEST_NS:
         raise ValueError(f"a message was recorded at {str(record_ns)[:40]} ns")
+
+
+@lru_cache(maxsize=64)
+def _typestore(definition: MessageDefinition, type_name: str, is_ros1: bool) -> Typestore | None:
+    """Types of a topic: as the bag defines them, else as the current ROS does.
+
+    Kept: reading the standard types and writing decoders takes as long as opening a bag.
+    """
+    store = get_typestore(Stores.EMPTY)
+    # A standard type does not need its definition: a damaged one is ignored.
+    with suppress(Exception):
+        if definition.format == MessageDefinitionFormat.MSG:
+            store.register(get_types_from_msg(definition.data, type_name))
+        elif definition.format == MessageDefinitionFormat.IDL:
+            # One file, or all that it needs: for each a rule, `IDL: its name`, and the file.
+            for part in filter(None, definition.data.split(f"{'=' * 80}\n")):
+                named = part.startswith("IDL: ")
+                store.register(get_types_from_idl(part.partition("\n")[2] if named else part))
+    standard = _standard(is_ros1)
+    if type_name in store.fielddefs and _has_all_fields(store, standard):
+        return store
+    if type_name in standard.fielddefs:
+        return standard
+    if type_name not in DEFINITIONS:
+        return None
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+@lru_cache
+def _standard(is_ros1: bool) -> Typestore:
+    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
 
 
 def _has_all_fields(store: Typestore, standard: Typestore) -> bool:

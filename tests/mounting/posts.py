@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from caliv_graph.config.model import Config
+from caliv_graph.mounting.place import View, view_of
 from caliv_graph.products import LidarScan, MotionData, Trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
 
@@ -111,3 +115,22 @@ def config_of(*missing: str, **guesses: gtsam.Pose3) -> Config:
         xyz, rpy = T.translation().tolist(), np.degrees(T.rotation().rpy()).tolist()
         lidars[name] = {"topic": f"/{name}", "initial": {"xyz": xyz, "rpy_deg": rpy}}
     return Config.model_validate({"lidars": lidars, "ground": {"vehicle_height": 0.0}})
+
+
+@contextmanager
+def views_kept() -> Iterator[None]:
+    """Inside, what a LiDAR sees of a drive is made out once: no guess is part of it."""
+    kept: dict[tuple[int, int, str], tuple[View, object]] = {}
+
+    def once(recording: Any, trajectory: Any, config: Config, name: str, *more: Any) -> View:
+        key = (id(recording), id(trajectory), name)
+        if key not in kept:
+            # With what the key is of, lest another gets its number.
+            of = view_of(recording, trajectory, config, name, *more)
+            kept[key] = (of, (recording, trajectory))
+        return kept[key][0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("caliv_graph.mounting.doubts.view_of", once)
+        patch.setattr("caliv_graph.mounting.place.view_of", once)
+        yield

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import gtsam
@@ -16,7 +17,7 @@ from caliv_graph.mounting.place import place_lidars
 from caliv_graph.products import Trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.wording.mounting import mistake_sentence
-from tests.mounting.posts import Drive, config_of
+from tests.mounting.posts import Drive, config_of, views_kept
 
 FRONT = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.17, 0.0), np.array([2.0, 0.0, 2.0]))
 REAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.17, math.pi), np.array([-0.4, 0.0, 2.0]))
@@ -25,6 +26,12 @@ ERROR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.03, 0.04), np.array([0.06, -0.07,
 DRIVE = Drive({"front": FRONT, "rear": REAR})
 GUESSES = config_of(front=FRONT.compose(ERROR), rear=REAR.compose(ERROR))
 DOWN = gtsam.Pose3(gtsam.Rot3(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def keep_views() -> Iterator[None]:
+    with views_kept():
+        yield
 
 
 def turned(degrees: float, T: gtsam.Pose3) -> gtsam.Pose3:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import gtsam
 import numpy as np
@@ -13,7 +14,15 @@ from caliv_graph.config.guesses import configured_guess
 from caliv_graph.errors import ConfigError
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.mounting.place import place_lidars
-from tests.mounting.posts import AHEAD, SPIN, Drive, config_of
+from tests.mounting.posts import AHEAD, SPIN, Drive, config_of, views_kept
+
+DRIVE = Drive({"spin": SPIN, "ahead": AHEAD})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def keep_views() -> Iterator[None]:
+    with views_kept():
+        yield
 
 
 def error(found: gtsam.Pose3, true: gtsam.Pose3) -> tuple[float, float]:
@@ -22,12 +31,11 @@ def error(found: gtsam.Pose3, true: gtsam.Pose3) -> tuple[float, float]:
 
 
 def test_two_lidars_are_found_from_nothing() -> None:
-    drive = Drive({"spin": SPIN, "ahead": AHEAD})
     config, placements = place_lidars(
-        [drive], [drive.way], config_of("spin", "ahead"), SilentProgress()
+        [DRIVE], [DRIVE.way], config_of("spin", "ahead"), SilentProgress()
     )
     assert [p.lidar for p in placements] == ["spin", "ahead"]
-    for name, true in drive.mountings.items():
+    for name, true in DRIVE.mountings.items():
         degrees, metres = error(config.lidars[name].guess(), true)
         assert degrees < 2.0
         assert metres < 0.25
@@ -36,14 +44,13 @@ def test_two_lidars_are_found_from_nothing() -> None:
 
 
 def test_a_guess_that_is_given_stays() -> None:
-    drive = Drive({"spin": SPIN, "ahead": AHEAD})
     given = config_of("spin", ahead=AHEAD)
-    config, (placement,) = place_lidars([drive], [drive.way], given, SilentProgress())
+    config, (placement,) = place_lidars([DRIVE], [DRIVE.way], given, SilentProgress())
     assert placement.lidar == "spin"
     assert config.lidars["ahead"] is given.lidars["ahead"]
     assert error(config.lidars["spin"].guess(), SPIN)[1] < 0.25
     untouched, none = place_lidars(
-        [drive], [drive.way], config_of(spin=SPIN, ahead=AHEAD), SilentProgress()
+        [DRIVE], [DRIVE.way], config_of(spin=SPIN, ahead=AHEAD), SilentProgress()
     )
     assert none == ()
     assert untouched == config_of(spin=SPIN, ahead=AHEAD)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from caliv_graph.conventions import AXES
@@ -16,7 +19,6 @@ from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.results.truth_file import read_truth
 from caliv_graph.uncertainty.evaluation import evaluate
 from caliv_graph.uncertainty.pairs import pair_determined, sigmas_s2s
-from scripts._bags import copied
 from tests.cli.commands import called
 
 FRONT, REAR = "/lidar/front/points", "/lidar/rear/points"
@@ -102,14 +104,27 @@ def write_config(drive: Path, path: Path, **sections: Any) -> Path:
     return path
 
 
+@cache
+def recorded(bag: Path) -> tuple[tuple[Connection, int, bytes], ...]:
+    """The messages of a bag: connection, record time in ns and content."""
+    with Reader(bag) as reader:
+        return tuple((c, record_ns, bytes(raw)) for c, record_ns, raw in reader.messages())
+
+
 def rewritten(drive: Path, folder: Path, change: Change) -> Path:
     """Writes the drive's bag anew with other messages; returns its folder."""
-    with copied(drive / "drive", folder, _STORE) as bag:
-        for connection, record_ns, raw in bag.messages():
+    messages = recorded(drive / "drive")
+    types = {c.topic: c.msgtype for c, _, _ in messages}
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        to = {
+            topic: writer.add_connection(topic, name, typestore=_STORE)
+            for topic, name in types.items()
+        }
+        for connection, record_ns, raw in messages:
             name = connection.msgtype
             message = _STORE.deserialize_cdr(raw, name)
             for new_ns, new in change(connection.topic, record_ns, message):
-                bag.write(connection.topic, new_ns, _STORE.serialize_cdr(new, name))
+                writer.write(to[connection.topic], new_ns, _STORE.serialize_cdr(new, name))
     return folder
 
 

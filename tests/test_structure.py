@@ -78,6 +78,14 @@ def by_target() -> Calibration:
     return run_on(arc().asked(structure=StructureConfig(use=False))).calibration
 
 
+@cache
+def by_walls() -> tuple[CalibrationRun, Structure]:
+    """By structure that knows where all LiDARs are, without a target."""
+    with pytest.MonkeyPatch.context() as patch:
+        walls = structure(patch, Structure(arc().truth))
+        return run_on(arc().asked(target=False)), walls
+
+
 def errors_of(calibration: Calibration, truth: dict[str, gtsam.Pose3]) -> dict[str, np.ndarray]:
     return {
         name: vehicle_axes_difference(lidar.T_vehicle_lidar, truth[name])
@@ -85,10 +93,10 @@ def errors_of(calibration: Calibration, truth: dict[str, gtsam.Pose3]) -> dict[s
     }
 
 
-def test_without_a_target_structure_calibrates_alone(walls: Structure, tmp_path: Path) -> None:
+def test_without_a_target_structure_calibrates_alone(tmp_path: Path) -> None:
     drive = arc().asked(target=False)
 
-    run = run_on(drive)
+    run, walls = by_walls()
 
     result = run.calibration
     assert walls.called == 1
@@ -132,8 +140,8 @@ def check_files(run: CalibrationRun, drive: ChairDrive, folder: Path) -> None:
     calibration_table(result)
 
 
-def test_its_result_is_compared_merged_and_a_prior(walls: Structure) -> None:
-    alone = run_on(arc().asked(target=False)).calibration
+def test_its_result_is_compared_merged_and_a_prior() -> None:
+    alone = by_walls()[0].calibration
     # As of another drive of the vehicle.
     alone = replace(alone, provenance={**alone.provenance, DRIVES: ["another"], MARKS: [[]]})
     other = by_target()

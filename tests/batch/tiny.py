@@ -16,7 +16,7 @@ def tiny_drive(folder: Path, seed: int) -> Path:
     Returns:
         The config; what it asks for is little enough to be reached.
     """
-    scenario = paper_scenario(rate_hz=1.25, position_sigma_m=0.005, rotation_sigma_rad=0.001)
+    scenario = paper_scenario(rate_hz=1.0, position_sigma_m=0.005, rotation_sigma_rad=0.001)
     coarse = {
         name: lidar.model_copy(update={"channels": 76, "horizontal_resolution_deg": 0.36})
         for name, lidar in scenario.lidars.items()
@@ -27,7 +27,7 @@ def tiny_drive(folder: Path, seed: int) -> Path:
     document |= {
         "extraction": {"min_points": 20, "min_scans": 4},
         "ground": {"use": False},
-        "registration": {"components": 80, "max_iterations": 30, "max_points": 100},
+        "registration": {"components": 40, "max_iterations": 8, "max_points": 60},
         "require": [],
         "solve": {"mode": "staged"},
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from caliv_graph.simulation import Scenario, SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.targets import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
-from caliv_graph.trajectory.select import smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from scripts._thinned import (
     BeamSelection,
     GroundWaves,
@@ -38,6 +39,7 @@ from scripts._thinned import (
     scenario_digest,
     select_beams,
 )
+from tests.kept import KeptDrive
 from tests.targets.ground.scans import plane_in
 
 FRONT = LidarModel(
@@ -94,14 +96,26 @@ def selected() -> BeamSelection:
     return select_beams(scenario_of())
 
 
+@cache
+def whole_and_quiet() -> KeptDrive:
+    """The drive without noise, all its beams cast once."""
+    return KeptDrive(silent(scenario_of()), 3)
+
+
 def config_for(recording: SimulatedRecording) -> Config:
     return parse_config(config_of(recording, has_bag=True), "test", Path())
 
 
+@cache
+def smoothed() -> Sequence[VehicleTrajectory]:
+    """Of both kinds of recording: they have the same motion, as a test below finds."""
+    whole = whole_and_quiet()
+    return smooth_trajectories([whole], config_for(whole), [[]])
+
+
 def observed(recording: SimulatedRecording) -> TargetObservation:
-    config = config_for(recording)
     recordings: list[Recording] = [recording]
-    trajectories = smooth_trajectories(recordings, config, [[]])
+    config, trajectories = config_for(recording), smoothed()
     # The box in the region is a placement of its own.
     box, chair = extract_targets(recordings, trajectories, config, SilentProgress())
     assert box.centre_map[0] > 11.0 > chair.centre_map[0]
@@ -109,10 +123,9 @@ def observed(recording: SimulatedRecording) -> TargetObservation:
 
 
 def test_without_noise_the_target_has_the_same_points() -> None:
-    scenario = silent(scenario_of())
-    thin = ThinnedRecording(scenario, selected(), 3)
+    thin = ThinnedRecording(whole_and_quiet().scenario, selected(), 3)
 
-    whole, thinned = observed(simulate_drive(scenario, 3)), observed(thin)
+    whole, thinned = observed(whole_and_quiet()), observed(thin)
 
     assert len(whole.clouds) > 20
     assert [(c.lidar, c.stamp_ns) for c in thinned.clouds] == [
@@ -133,8 +146,9 @@ def test_without_noise_the_target_has_the_same_points() -> None:
 
 def test_the_beams_that_are_kept_return_what_whole_clouds_do() -> None:
     """And those that are left out meet nothing in the target's region but ground."""
-    scenario = silent(scenario_of())
-    whole, thin = simulate_drive(scenario, 3), ThinnedRecording(scenario, selected(), 3)
+    whole = whole_and_quiet()
+    scenario = whole.scenario
+    thin = ThinnedRecording(scenario, selected(), 3)
     low, high = whole.world.bounds("chair")
     margin_m = scenario.world.region_margin_m
     walker = whole.world.names.index("passer_by")

@@ -24,7 +24,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     document = yaml.safe_load((folder / "config.yaml").read_text())
     document |= {
         "solve": {"mode": "staged"},
-        "registration": {"components": 300, "max_points": 250},
+        "registration": {"components": 150, "max_points": 120},
     }
     document |= {"ground": {"use": False}}
     (folder / "my_config.yaml").write_text(yaml.safe_dump(document))

@@ -262,8 +262,8 @@ class TestFindsTheChair:
         assert min(found.scans.values()) >= 5
 
     def test_the_extraction_finds_it_in_the_region(self) -> None:
-        drive = recorded("roundabout", 2)
-        found = drive.find()
+        drive = recorded("roundabout")
+        found = found_in("roundabout", 0)
         extractor = RegionExtractor(found.region, drive.config, drive.trajectory)
         off = []
         for name in drive.config.lidars:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 from threadpoolctl import threadpool_limits
@@ -18,6 +18,7 @@ from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
 from caliv_graph.calibration.given_noise import noise_by_structure
 from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.ground_floors import with_floors
+from caliv_graph.calibration.ground_scatter import larger_normal_rad
 from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.no_target import (
     solution_without_target,
@@ -41,16 +42,19 @@ from caliv_graph.calibration.sensor_noise import (
     with_noise,
 )
 from caliv_graph.calibration.solve import (
+    SolveState,
     reduced_registered,
     settle,
     solve_registered,
     step_of_all,
 )
 from caliv_graph.calibration.staged import staged_solution
-from caliv_graph.calibration.structure import lidars_with_structure
+from caliv_graph.calibration.structure import far_from, lidars_with_structure
 from caliv_graph.calibration.structure_evidence import (
     NO_STRUCTURE,
+    NOTHING_TOLD,
     StructureEvidence,
+    ToldErrors,
     kept_stamps,
     other_grounds,
     rough_extrinsics,
@@ -155,15 +159,87 @@ def _estimate(
         noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
         trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
         problem = pose_problem(observations, trajectories, config, noise, kept_ns=kept)
-    times = {"registration": rough.registration_s}
+    times = {"registration": rough.registration_s, "graph": rough.graph_s}
+    whole = _Whole(problem, trajectories, grounds, structure, noise, kept, config)
+    solved = _solved(whole, observations, rough.state, told, times, progress)
+    # What the target alone told may have been far off: structure is linearised where all leads.
+    again = far_from(solved.terms, solved.state.problem.extrinsics(solved.state.values))
+    normal_rad, at = None, solved.state
+    if at.ground_weights is not None and config.noise.ground_normal_deg is None:
+        normal_rad = larger_normal_rad(
+            at.problem, at.grounds, at.ground_weights, at.values, float(noise.floors[0])
+        )
+    if normal_rad is not None:
+        before, noise = noise, noise.with_ground_normal(normal_rad)
+        extrinsics = rough_extrinsics(solved.state)
+        grounds = with_floors(grounds, trajectories, extrinsics, before.floors, noise.floors)
+        whole = replace(whole, grounds=grounds, noise=noise)
+    if again or normal_rad is not None:
+        solved = _solved(whole, observations, solved.state, NOTHING_TOLD, times, progress)
+    if solved.offsets_s is not None:
+        rough = replace(rough, offsets_s=solved.offsets_s)
+    said = (line for term in solved.terms for line in term.warnings)
+    solution = solved.solution
+    warnings = (*rough.warnings, *solved.alike, *said, *_unconverged(solution.registrations))
+    solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
+    return solution, tuple(trajectories)
 
+
+@dataclass(frozen=True)
+class _Whole:
+    """What all stages after the noise of the sensors are given."""
+
+    problem: Problem
+    trajectories: Sequence[VehicleTrajectory]
+    grounds: Sequence[GroundObservation]
+    structure: StructureEvidence
+    noise: SensorNoise
+    kept: Mapping[int, Sequence[int]]
+    config: Config
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Their outcome.
+
+    Attributes:
+        solution: the calibration.
+        state: the solved graph.
+        terms: of structure.
+        offsets_s: LiDAR -> 1 sigma in seconds of each time offset; None: structure was not asked.
+        alike: a warning for each symmetric target.
+    """
+
+    solution: Solution
+    state: SolveState
+    terms: tuple[StructureTerm, ...]
+    offsets_s: dict[str, float] | None
+    alike: tuple[str, ...]
+
+
+def _solved(
+    whole: _Whole,
+    observations: Sequence[TargetObservation],
+    begun_at: SolveState,
+    told: ToldErrors,
+    times: dict[str, float],
+    progress: Progress,
+) -> _Solved:
+    """Registers again from a solved graph, solves structure near it, and refines.
+
+    `told` is what structure said of slow errors, and from where; `times` are added to.
+    """
+    problem, trajectories, config = whole.problem, whole.trajectories, whole.config
+    structure, noise = whole.structure, whole.noise
+    limit = config.registration.max_iterations
+    extrinsics = problem.extrinsics(begun_at.values)
     # Register again, from the solved graph: EM ends near where it starts, and the result shall
     # depend on the data, not on the initial guess. Aligned clouds also give better normals.
     begun = time.perf_counter()
     # All clouds from here on: those that the field of view cuts off have predicted poses now.
-    lines = linearise_clouds(problem, rough.state.values)
+    lines = linearise_clouds(problem, begun_at.values)
     problem = replace(problem, moved_with=extrinsics)
-    grounds = _held_grounds(grounds, extrinsics, problem)
+    grounds = _held_grounds(whole.grounds, extrinsics, problem)
     states = [
         JointRegistration(
             _deskewed(o, extrinsics, trajectories),
@@ -189,26 +265,25 @@ def _estimate(
     terms: tuple[StructureTerm, ...] = ()
     if structure.patches:
         with progress.stage("solving walls and other surfaces", None):
-            terms = structure.terms_beside(rough.state, problem, trajectories, noise.heave_m, told)
-        times["structure"] = time.perf_counter() - begun
+            terms = structure.terms_beside(begun_at, problem, trajectories, noise.heave_m, told)
+        times["structure"] = times.get("structure", 0.0) + time.perf_counter() - begun
 
     begun = time.perf_counter()
+    offsets_s = None
     if terms:
         others = lidars_with_structure(terms)
         grounds = other_grounds(grounds, terms)
-        problem = pose_problem(observations, trajectories, config, noise, others, kept)
+        problem = pose_problem(observations, trajectories, config, noise, others, whole.kept)
         problem = replace(problem, moved_with=extrinsics)
         solve, offsets_s = solved_with_structure(
             problem, registrations, grounds, config, found, terms, extrinsics
         )
-        rough = replace(rough, offsets_s=offsets_s)
     else:
         solve = solve_registered(problem, registrations, grounds, config, found)
     if has_clock(problem):
         reduced = reduced_registered(solve, registrations)
         solve = under_clock_prior(solve, reduced, None)
         settle(solve, registrations, step_of_all(solve))
-    times["graph"] = rough.graph_s
     most = refinements(config.noise.lidar_range_m)
     total = most + OTHER_STARTS * further_refinements(config.noise.lidar_range_m)
     with (
@@ -222,12 +297,10 @@ def _estimate(
     if config.solve.mode == "staged":
         with progress.stage("solving the graph in two stages", None):
             solution = replace(staged_solution(solve, registrations), course=course)
-    times["refinement"] = time.perf_counter() - begun - solve.graph_seconds
+    spent = time.perf_counter() - begun - solve.graph_seconds
+    times["refinement"] = times.get("refinement", 0.0) + spent
     times["graph"] += solve.graph_seconds
-    said = (line for term in terms for line in term.warnings)
-    warnings = (*rough.warnings, *alike, *said, *_unconverged(solution.registrations))
-    solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
-    return solution, tuple(trajectories)
+    return _Solved(solution, solve, terms, offsets_s, tuple(alike))
 
 
 def _with_noise(

@@ -110,6 +110,15 @@ class SensorNoise:
     opened: tuple[str, ...] = ()
     levels: tuple[NoiseLevel, ...] = ()
 
+    def with_ground_normal(self, sigma_rad: float) -> SensorNoise:
+        """The same with another 1 sigma of the tilt of ground planes."""
+        levels = tuple(
+            replace(level, sigma=sigma_rad) if level.name == "ground_normal" else level
+            for level in self.levels
+        )
+        floors = np.array([sigma_rad, sigma_rad, self.floors[2]])
+        return replace(self, floors=floors, levels=levels)
+
 
 def estimated_noise(
     state: SolveState,

@@ -20,6 +20,12 @@ from caliv_graph.conventions import (
 from caliv_graph.products import Array, StandingErrors, StructureTerm
 from caliv_graph.trajectory.factors import Gaussian, tangent_size
 
+FAR_RAD, FAR_M = 0.02, 0.1
+"""Distance of a LiDAR from where a term was linearised, beyond which it is solved anew. Half of its
+square times a slope is what is left out: 0.1 rad of yaw on ground that slopes by 2 % turn the LiDAR
+by 0.1 mrad, which is its sigma (`slalom` of the second simulator, seed 11, where the target alone
+was 0.1 rad and 0.6 m off)."""
+
 RIDGE = 1e-9
 """Relative ridge under which the constant of a term is computed: a term is semidefinite."""
 
@@ -55,6 +61,20 @@ def lidars_with_structure(terms: Sequence[StructureTerm]) -> frozenset[str]:
         for name, own in rows_of_lidars(term).items()
         if np.diag(term.information)[own].any()
     )
+
+
+def far_from(terms: Sequence[StructureTerm], T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> bool:
+    """Whether a LiDAR is so far from where some term was linearised that the term is not right.
+
+    `T_vehicle_lidar` are of all LiDARs that the terms say anything of.
+    """
+    for term in terms:
+        for name in lidars_with_structure([term]):
+            away = term.T_vehicle_lidar[name].between(T_vehicle_lidar[name])
+            turn = float(np.linalg.norm(gtsam.Rot3.Logmap(away.rotation())))
+            if turn > FAR_RAD or float(np.linalg.norm(away.translation())) > FAR_M:
+                return True
+    return False
 
 
 def nearest_extrinsics(

@@ -21,7 +21,7 @@ from caliv_graph.calibration.graph import (
 from caliv_graph.calibration.linear import CloudLinearisation, retract
 from caliv_graph.calibration.problem import Problem, moved_map, pose_problem
 from caliv_graph.calibration.reduced import Reduced, reduce_to_extrinsics
-from caliv_graph.calibration.structure import structure_graph
+from caliv_graph.calibration.structure import FAR_M, FAR_RAD, far_from, structure_graph
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_imu_rotation, key_lever_arm, key_offset, key_vehicle
 from caliv_graph.products import (
@@ -326,6 +326,27 @@ def test_another_map_other_names_and_another_reference_change_nothing() -> None:
     rows = np.concatenate([6 * lidars.index(n) + np.arange(6) for n in order])
     np.testing.assert_allclose(second.D, first.D[np.ix_(rows, rows)], rtol=1e-5, atol=10.0)
     np.testing.assert_allclose(second.c, first.c[rows], rtol=1e-5, atol=1e-2)
+
+
+def test_a_term_is_linearised_anew_where_a_lidar_is_far_from_where_it_was() -> None:
+    trajectory = given()
+    term = term_of(trajectory, trajectory.trajectory.stamps_ns, ("front", "rear"))
+    there = dict(term.T_vehicle_lidar)
+    assert not far_from((term,), there)
+    assert not far_from((), there)
+    for step, far in ((0.9, False), (1.1, True)):
+        for d in (
+            [0.0, 0.0, step * FAR_RAD, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0, 0.0, step * FAR_M, 0.0],
+        ):
+            moved = there | {"rear": there["rear"].retract(np.array(d))}
+            assert far_from((term,), moved) is far
+    # Of a LiDAR that a term says nothing of, it does not matter where it is.
+    rear = slice(len(term.information) - 6, None)
+    silent = term.information.copy()
+    silent[rear] = silent[:, rear] = 0.0
+    gone = there | {"rear": pose((9.0, 9.0, 9.0), (0.0, 0.0, 90.0))}
+    assert not far_from((replace(term, information=silent),), gone)
 
 
 def test_a_lidar_or_a_pose_that_the_problem_lacks_is_refused() -> None:

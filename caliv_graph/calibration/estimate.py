@@ -173,8 +173,11 @@ def _estimate(
         before, noise = noise, noise.with_ground_normal(normal_rad)
         extrinsics = rough_extrinsics(solved.state)
         grounds = with_floors(grounds, trajectories, extrinsics, before.floors, noise.floors)
-        whole = replace(whole, grounds=grounds, noise=noise)
     if again or normal_rad is not None:
+        # With the LiDARs of the solved graph: its keys are numbered by them.
+        others = lidars_with_structure(solved.terms)
+        problem = pose_problem(observations, trajectories, config, noise, others, kept)
+        whole = replace(whole, problem=problem, grounds=grounds, noise=noise)
         solved = _solved(whole, observations, solved.state, NOTHING_TOLD, times, progress)
     if solved.offsets_s is not None:
         rough = replace(rough, offsets_s=solved.offsets_s)
@@ -237,7 +240,8 @@ def _solved(
     # depend on the data, not on the initial guess. Aligned clouds also give better normals.
     begun = time.perf_counter()
     # All clouds from here on: those that the field of view cuts off have predicted poses now.
-    lines = linearise_clouds(problem, begun_at.values)
+    moved_with = begun_at.problem.moved_with
+    lines = linearise_clouds(replace(problem, moved_with=moved_with), begun_at.values)
     problem = replace(problem, moved_with=extrinsics)
     grounds = _held_grounds(whole.grounds, extrinsics, problem)
     states = [

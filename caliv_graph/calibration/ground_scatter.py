@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -13,11 +13,11 @@ from scipy.stats import chi2
 from caliv_graph.calibration.ground import GroundWeights, ground_centre, taken_poses
 from caliv_graph.calibration.ground_factors import ground_plane_factor
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.conventions import key_ground, key_ground_bias, key_vehicle
+from caliv_graph.conventions import key_ground, key_ground_bias, key_rates, key_vehicle
 from caliv_graph.products import Array, GroundObservation
 
 FEWEST_PLANES = 8
-"""Planes whose tilts say that they scatter more than was estimated, at least."""
+"""Planes, and tilts beyond those that are fitted, at least: a variance to a half."""
 
 LARGEST_RATIO, CHANCE = 1.5, 1e-3
 """Mean square of tilts in their variance from which they do, unless by chance."""
@@ -43,16 +43,20 @@ def larger_normal_rad(
     ground. Planes that scatter more than their sigmas say, `normal_rad` included, do so by waves.
     `values` is the solution, `weights` are the robust ones of the observations there.
     """
-    tilts, variances, fitted = _tilts(problem, observations, weights, values)
-    if len(tilts) < FEWEST_PLANES:
+    planes = _Planes.of(problem, observations, weights, values)
+    tilts, variances = planes.tilts, planes.variances
+    free = tilts.size - planes.fitted
+    if len(tilts) < FEWEST_PLANES or free < FEWEST_PLANES:
         return None
-    free = tilts.size - fitted
 
     def squares(more: float) -> float:
         # Outliers count as three sigmas.
         return float(np.minimum(tilts**2 / (variances + more), 9.0).sum())
 
-    if squares(0.0) < LARGEST_RATIO * free or chi2.sf(squares(0.0), free) > CHANCE:
+    ratio = squares(0.0) / free
+    # Waves that scans share are as many as there are places; noise of the points is of each scan.
+    apart = free / float(np.mean(1.0 + planes.repeated * normal_rad**2 / variances**2))
+    if ratio < LARGEST_RATIO or chi2.sf(ratio * apart, apart) > CHANCE:
         return None
     low, high = 0.0, float(np.max(tilts**2))
     for _ in range(ROUNDS):
@@ -61,31 +65,49 @@ def larger_normal_rad(
     return float(np.sqrt(normal_rad**2 + high))
 
 
-def _tilts(
-    problem: Problem,
-    observations: Sequence[GroundObservation],
-    weights: GroundWeights,
-    values: gtsam.Values,
-) -> tuple[Array, Array, int]:
-    """Tilts (n, 2) of planes to the ground at a solution, rad, their variances, and what is fitted.
+@dataclass(frozen=True)
+class _Planes:
+    """Planes of full weight at a solution.
 
-    Without what biases of the ranges do to them.
+    Attributes:
+        tilts: (n, 2) to the ground, rad, without what biases of the ranges do to them.
+        variances: (n, 2) of these.
+        repeated: (n, 2) `GroundObservation.repeated`: that of waves, by the other scans of a place.
+        fitted: number of tilts that the solution is fitted to.
     """
-    taken = taken_poses(problem, observations)
-    lidars = set()
-    rows = []
-    for n, o in enumerate(observations):
-        if taken[n] < 0 or weights.planes[n] < FULL:
-            continue
-        bias = key_ground_bias(problem.lidars.index(o.lidar))
-        factor: Any = ground_plane_factor(
-            (key_vehicle(int(taken[n])), *problem.extrinsic_keys_of(o.lidar)),
-            key_ground(o.drive),
-            ground_centre(problem, o.drive),
-            replace(o, cov=np.eye(3)),
-            key_bias=bias if values.exists(bias) else None,
-        )
-        lidars.add((o.drive, o.lidar))
-        rows.append((np.array(factor.linearize(values).getb())[:2], np.diag(o.cov)[:2]))
-    tilts, variances = (np.array([row[k] for row in rows]).reshape(-1, 2) for k in range(2))
-    return tilts, variances, 2 * (len(lidars) + len({drive for drive, _ in lidars}))
+
+    tilts: Array
+    variances: Array
+    repeated: Array
+    fitted: int
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        observations: Sequence[GroundObservation],
+        weights: GroundWeights,
+        values: gtsam.Values,
+    ) -> _Planes:
+        """Of those among the observations whose pose the problem has."""
+        taken = taken_poses(problem, observations)
+        seen = [n for n in range(len(observations)) if taken[n] >= 0 and weights.planes[n] >= FULL]
+        out = np.zeros((3, len(seen), 2))
+        for row, n in enumerate(seen):
+            o = observations[n]
+            bias, rates = key_ground_bias(problem.lidars.index(o.lidar)), key_rates(o.drive)
+            factor: Any = ground_plane_factor(
+                (key_vehicle(int(taken[n])), *problem.extrinsic_keys_of(o.lidar)),
+                key_ground(o.drive),
+                ground_centre(problem, o.drive),
+                replace(o, cov=np.eye(3)),
+                key_bias=bias if values.exists(bias) else None,
+                key_rates=rates if values.exists(rates) else None,
+            )
+            tilt = np.array(factor.linearize(values).getb())[:2]
+            repeated = np.zeros(2) if o.repeated is None else o.repeated[:2]
+            out[:, row] = tilt, np.diag(o.cov)[:2], repeated
+        lidars = {observations[n].lidar for n in seen}
+        drives = {observations[n].drive for n in seen}
+        tilts, variances, repeated = out
+        return cls(tilts, variances, repeated, 2 * (len(lidars) + len(drives)))

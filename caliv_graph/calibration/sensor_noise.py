@@ -88,6 +88,9 @@ SLOW: Mapping[str, Slow] = {
 
 START_TIMES_S = (8.0, 40.0)
 
+RESIDUALS = "residuals of the LiDARs"
+"""Source of an estimated figure."""
+
 OPEN = "expected: LiDARs and motion data leave it open"
 """Source of the figure of an error whose size is integrated out."""
 
@@ -113,7 +116,9 @@ class SensorNoise:
     def with_ground_normal(self, sigma_rad: float) -> SensorNoise:
         """The same with another 1 sigma of the tilt of ground planes."""
         levels = tuple(
-            replace(level, sigma=sigma_rad) if level.name == "ground_normal" else level
+            replace(level, sigma=sigma_rad, source=RESIDUALS)
+            if level.name == "ground_normal"
+            else level
             for level in self.levels
         )
         floors = np.array([sigma_rad, sigma_rad, self.floors[2]])
@@ -286,7 +291,7 @@ def _levels(
     def source(name: str) -> str:
         if given[name] is not None:
             return "config"
-        return "residuals of the LiDARs" if name in estimated else "the usual figure"
+        return RESIDUALS if name in estimated else "the usual figure"
 
     figures = (
         ("heave", noise.heave_m, "m"),
@@ -299,7 +304,7 @@ def _levels(
         parts = ("horizontal", "vertical") if error.kind == "gnss" else ("tilt", "yaw")
         for part, sigma in zip(parts, error.sigmas[::2], strict=True):
             name = f"{error.kind}_correlated_{part}"
-            told = OPEN if error.kind in noise.opened else "residuals of the LiDARs"
+            told = OPEN if error.kind in noise.opened else RESIDUALS
             out.append(NoiseLevel(name, sigma, unit, told, error.time_s))
     return tuple(out)
 

@@ -66,9 +66,10 @@ def lidars_with_structure(terms: Sequence[StructureTerm]) -> frozenset[str]:
 def far_from(terms: Sequence[StructureTerm], T_vehicle_lidar: Mapping[str, gtsam.Pose3]) -> bool:
     """Whether a LiDAR is so far from where some term was linearised that the term is not right.
 
-    `T_vehicle_lidar` are of all LiDARs that the terms say anything of.
+    `T_vehicle_lidar` are of all LiDARs that the terms say anything of. A term by the odometry of a
+    LiDAR is about that LiDAR's mounting, wherever the calibration puts it.
     """
-    for term in terms:
+    for term in (term for term in terms if not term.odometry_of):
         for name in lidars_with_structure([term]):
             away = term.T_vehicle_lidar[name].between(T_vehicle_lidar[name])
             turn = float(np.linalg.norm(gtsam.Rot3.Logmap(away.rotation())))

@@ -199,7 +199,9 @@ def fitted_noise(
         per_m = first_tilts_per_m(level)
         sizes = sighting * per_m, strip * per_m, nuisances.tilt_times
     else:
-        sizes = fitted_tilts(sightings, geometry, lidar, weights, level, sighting, nuisances)
+        sizes = fitted_tilts(
+            sightings, geometry, lidar, weights, level, sighting, nuisances, layout.lidars
+        )
     own_tilt, strip_tilt, tilt_times = sizes
     return replace(
         nuisances,

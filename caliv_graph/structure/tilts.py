@@ -84,6 +84,7 @@ def fitted_tilts(
     level: BoolArray,
     sighting_m: Array,
     before: Nuisances,
+    lidars: int,
 ) -> tuple[Array, Array, Array]:
     """1 sigma (K,) of the tilt of a sighting of each strip, and of what a LiDAR repeats of it, rad.
 
@@ -103,11 +104,12 @@ def fitted_tilts(
         level: (K,) which strips are ground.
         sighting_m: (K,) 1 sigma of the offset of each sighting.
         before: all sizes before.
+        lidars: number of the LiDARs, some of which may have no sighting.
     """
     own_rad, repeated = sighting_m * first_tilts_per_m(level), np.array(before.strip_tilt)
-    lidars = int(lidar.max(initial=0)) + 1
-    times = np.ones((max(lidars, len(before.tilt_times)), 2))
-    times[: len(before.tilt_times)] = before.tilt_times
+    times = np.ones((lidars, 2))
+    if len(before.tilt_times):
+        times = before.tilt_times.copy()
     at = np.flatnonzero(weights > 0.5)
     if not len(at):
         return own_rad, repeated, times

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 
 from caliv_graph.calibration.ground import full_weights
 from caliv_graph.calibration.ground_scatter import FEWEST_PLANES, larger_normal_rad
+from caliv_graph.products import Array
 from tests.calibration.problems import make_case
 from tests.calibration.test_ground import SIGMAS, observed, with_planes
 
@@ -47,3 +51,34 @@ def test_few_planes_say_nothing() -> None:
     case = make_case(count=2)
     assert len(case.problem.lidars) * 2 < FEWEST_PLANES
     assert asked(10 * NORMAL_RAD, count=2) is None
+
+
+def test_several_drives_with_a_plane_or_two_each_say_nothing() -> None:
+    """Each drive's plane is fitted to what is seen of it."""
+    case = make_case(count=5)
+    drives = tuple((i, stamp_ns) for i, (_, stamp_ns) in enumerate(case.problem.poses))
+    problem = replace(case.problem, poses=drives)
+    rng = np.random.default_rng(0)
+    planes = observed(problem, case.truth, PLANE, lambda _: 10 * SIGMAS * rng.normal(size=3))
+    values, weights = with_planes(case.truth, PLANE, range(5)), full_weights(problem, planes)
+    assert len(planes) > FEWEST_PLANES
+    assert larger_normal_rad(problem, planes, weights, values, NORMAL_RAD) is None
+
+
+def by_place(waves: Array, n: int) -> Array:
+    return np.asarray(waves[n % len(waves)])
+
+
+def test_scans_of_one_place_are_no_more_than_one() -> None:
+    """Three places seen ten times each, waves alone: they are seldom as the mean has it."""
+    floors = np.array([NORMAL_RAD, NORMAL_RAD, 0.002]) ** 2
+    found = 0
+    for seed in range(20):
+        case = make_case(count=30)
+        rng = np.random.default_rng(seed)
+        waves = NORMAL_RAD * np.append(rng.normal(size=(3, 2)), np.zeros((3, 1)), axis=1)
+        planes = observed(case.problem, case.truth, PLANE, partial(by_place, waves))
+        alike = [replace(o, repeated=9.0 * floors) for o in planes]
+        weights, values = full_weights(case.problem, alike), with_planes(case.truth, PLANE)
+        found += larger_normal_rad(case.problem, alike, weights, values, NORMAL_RAD) is not None
+    assert found <= 1

@@ -12,6 +12,8 @@ from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.tilts import USUAL_RAD, fitted_tilts
 
 STRIPS, LIDARS, SCANS = 80, 2, 12
+MORE = 4
+"""LiDARs of the vehicle; some see no wall."""
 FEW = 4
 OFFSET_M, OWN_RAD, REPEATED_RAD = 4e-4, 1.6e-3, 7e-4
 
@@ -78,12 +80,15 @@ def sizes_of(
     sightings: Sightings, geometry: Geometry, lidar: IntArray, weights: Array
 ) -> tuple[Array, Array, Array]:
     offset, walls = np.full(STRIPS, OFFSET_M), np.zeros(STRIPS, np.bool_)
-    return fitted_tilts(sightings, geometry, lidar, weights, walls, offset, BEFORE)
+    return fitted_tilts(sightings, geometry, lidar, weights, walls, offset, BEFORE, MORE)
 
 
 def test_a_lidar_that_sees_walls_rougher_has_larger_tilts_and_the_others_have_not() -> None:
     """So do points on a tenth of a metre, where those of others are on two."""
     own, repeated, times = fitted(3, rougher=4.0)
+    # One that sees no wall in this round may see one in the next.
+    assert times.shape == (MORE, 2)
+    assert times[3:] == pytest.approx(1.0)
     assert times[:2, 1] == pytest.approx(1.0, abs=0.1)
     # The sizes of all have a part of it, so that the product is what counts.
     size = times[2, 1] * np.median(np.hypot(own, repeated))

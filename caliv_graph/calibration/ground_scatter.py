@@ -8,7 +8,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from caliv_graph.calibration.ground import GroundWeights, ground_centre, taken_poses
 from caliv_graph.calibration.ground_factors import ground_plane_factor
@@ -56,7 +56,7 @@ def larger_normal_rad(
     ratio = squares(0.0) / free
     # Waves that scans share are as many as there are places; noise of the points is of each scan.
     apart = free / float(np.mean(1.0 + planes.repeated * normal_rad**2 / variances**2))
-    if ratio < LARGEST_RATIO or chi2.sf(ratio * apart, apart) > CHANCE:
+    if ratio < LARGEST_RATIO or chdtrc(apart, ratio * apart) > CHANCE:
         return None
     low, high = 0.0, float(np.max(tilts**2))
     for _ in range(ROUNDS):

@@ -162,26 +162,27 @@ def _estimate(
     times = {"registration": rough.registration_s, "graph": rough.graph_s}
     whole = _Whole(problem, trajectories, grounds, structure, noise, kept, config)
     solved = _solved(whole, observations, rough.state, told, times, progress)
+    at = solved.state
     # What the target alone told may have been far off: structure is linearised where all leads.
-    again = far_from(solved.terms, solved.state.problem.extrinsics(solved.state.values))
-    normal_rad, at = None, solved.state
+    again = far_from(at.structure, at.problem.extrinsics(at.values))
+    normal_rad = None
     if at.ground_weights is not None and config.noise.ground_normal_deg is None:
         normal_rad = larger_normal_rad(
             at.problem, at.grounds, at.ground_weights, at.values, float(noise.floors[0])
         )
     if normal_rad is not None:
         before, noise = noise, noise.with_ground_normal(normal_rad)
-        extrinsics = rough_extrinsics(solved.state)
+        extrinsics = rough_extrinsics(at)
         grounds = with_floors(grounds, trajectories, extrinsics, before.floors, noise.floors)
     if again or normal_rad is not None:
         # With the LiDARs of the solved graph: its keys are numbered by them.
-        others = lidars_with_structure(solved.terms)
+        others = lidars_with_structure(at.structure)
         problem = pose_problem(observations, trajectories, config, noise, others, kept)
         whole = replace(whole, problem=problem, grounds=grounds, noise=noise)
-        solved = _solved(whole, observations, solved.state, NOTHING_TOLD, times, progress)
+        solved = _solved(whole, observations, at, NOTHING_TOLD, times, progress)
     if solved.offsets_s is not None:
         rough = replace(rough, offsets_s=solved.offsets_s)
-    said = (line for term in solved.terms for line in term.warnings)
+    said = (line for term in solved.state.structure for line in term.warnings)
     solution = solved.solution
     warnings = (*rough.warnings, *solved.alike, *said, *_unconverged(solution.registrations))
     solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
@@ -207,15 +208,13 @@ class _Solved:
 
     Attributes:
         solution: the calibration.
-        state: the solved graph.
-        terms: of structure.
+        state: the solved graph, terms of structure in it.
         offsets_s: LiDAR -> 1 sigma in seconds of each time offset; None: structure was not asked.
         alike: a warning for each symmetric target.
     """
 
     solution: Solution
     state: SolveState
-    terms: tuple[StructureTerm, ...]
     offsets_s: dict[str, float] | None
     alike: tuple[str, ...]
 
@@ -304,7 +303,7 @@ def _solved(
     spent = time.perf_counter() - begun - solve.graph_seconds
     times["refinement"] = times.get("refinement", 0.0) + spent
     times["graph"] += solve.graph_seconds
-    return _Solved(solution, solve, terms, offsets_s, tuple(alike))
+    return _Solved(solution, solve, offsets_s, tuple(alike))
 
 
 def _with_noise(

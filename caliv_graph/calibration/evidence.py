@@ -25,9 +25,9 @@ from caliv_graph.calibration.ground import (
     biased_lidars,
     ground_centre,
     place_weights,
+    plane_factor_of,
     taken_poses,
 )
-from caliv_graph.calibration.ground_factors import ground_plane_factor
 from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.motion_suspects import motion_parts
 from caliv_graph.calibration.noise import evenly_over_drives
@@ -321,14 +321,13 @@ def _ground_rows(state: SolveState, values: gtsam.Values, poses: IntArray) -> li
     for n, o in enumerate(state.grounds):
         if taken[n] not in poses or weight[n] < SEEN:
             continue
-        keys = (key_vehicle(int(taken[n])), *problem.extrinsic_keys_of(o.lidar))
         centre = ground_centre(problem, o.drive)
         # With a unit covariance, GTSAM's whitening leaves the residual as it is.
         plain = replace(o, cov=np.eye(3))
-        bias = key_ground_bias(problem.lidars.index(o.lidar))
-        factor = ground_plane_factor(keys, key_ground(o.drive), centre, plain, key_bias=bias)
+        factor = plane_factor_of(problem, plain, int(taken[n]), centre, rates=False)
         linear: Any = factor.linearize(values)
-        ends = np.cumsum([6] * len(keys) + [3])  # and the biases, if there are any
+        chain = 1 + len(problem.extrinsic_keys_of(o.lidar))
+        ends = np.cumsum([6] * chain + [3])  # and the biases, if there are any
         # A copy: GTSAM's array ends with the factor.
         blocks = np.split(np.array(linear.getA()), ends[: len(linear.keys()) - 1], axis=1)
         known = o.cov - floors + weights.heave_m[n] ** 2 * distance

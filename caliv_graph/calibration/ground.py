@@ -173,11 +173,7 @@ def ground_graph(
     )
     for o, i, weight, heave_m in weighted:
         if i >= 0 and weight > 0.0:
-            keys = (key_vehicle(i), *problem.extrinsic_keys_of(o.lidar))
-            plane, centre = key_ground(o.drive), centres[o.drive]
-            bias = key_ground_bias(problem.lidars.index(o.lidar))
-            rates = key_rates(o.drive) if o.drive in problem.rate_rows else None
-            factor = ground_plane_factor(keys, plane, centre, o, weight, heave_m, bias, rates)
+            factor = plane_factor_of(problem, o, i, centres[o.drive], weight, heave_m)
             graph.append("ground_plane", factor)
     if config.vehicle_height is None and config.parallel_sigma_deg is None:
         return graph
@@ -214,6 +210,27 @@ def _waves_below(problem: Problem, stands: Array) -> Array:
         places = [problem.T_map_vehicle[i].translation() for i in own.tolist()]
         shares[own] = sharing_places(np.array(places).reshape(-1, 3), stands[own])
     return np.sqrt(shares)[:, None] * problem.floors[[0, 2]]
+
+
+def plane_factor_of(
+    problem: Problem,
+    observation: GroundObservation,
+    pose: int,
+    centre: Array,
+    weight: float = 1.0,
+    heave_m: float = 0.0,
+    rates: bool = True,
+) -> gtsam.CustomFactor:
+    """`ground_plane_factor` with the variables that a problem has.
+
+    `pose` is the index of the observation's; without `rates` those of the drive are taken as exact.
+    """
+    keys = (key_vehicle(pose), *problem.extrinsic_keys_of(observation.lidar))
+    plane = key_ground(observation.drive)
+    bias = key_ground_bias(problem.lidars.index(observation.lidar))
+    erring = rates and observation.drive in problem.rate_rows
+    of_rates = key_rates(observation.drive) if erring else None
+    return ground_plane_factor(keys, plane, centre, observation, weight, heave_m, bias, of_rates)
 
 
 def place_weights(

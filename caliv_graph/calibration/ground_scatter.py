@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from scipy.special import chdtrc
 
-from caliv_graph.calibration.ground import GroundWeights, ground_centre, taken_poses
-from caliv_graph.calibration.ground_factors import ground_plane_factor
+from caliv_graph.calibration.evidence import SEEN
+from caliv_graph.calibration.ground import (
+    GroundWeights,
+    ground_centre,
+    plane_factor_of,
+    taken_poses,
+)
 from caliv_graph.calibration.problem import Problem
-from caliv_graph.conventions import key_ground, key_ground_bias, key_rates, key_vehicle
 from caliv_graph.products import Array, GroundObservation
 
 FEWEST_PLANES = 8
@@ -21,9 +24,6 @@ FEWEST_PLANES = 8
 
 LARGEST_RATIO, CHANCE = 1.5, 1e-3
 """Mean square of tilts in their variance from which they do, unless by chance."""
-
-FULL = 0.5
-"""Weight of a plane from which it is one of them."""
 
 ROUNDS = 40
 """Halvings of the interval in which the variance is looked for."""
@@ -67,7 +67,7 @@ def larger_normal_rad(
 
 @dataclass(frozen=True)
 class _Planes:
-    """Planes of full weight at a solution.
+    """Planes in use at a solution.
 
     Attributes:
         tilts: (n, 2) to the ground, rad, without what biases of the ranges do to them.
@@ -91,20 +91,13 @@ class _Planes:
     ) -> _Planes:
         """Of those among the observations whose pose the problem has."""
         taken = taken_poses(problem, observations)
-        seen = [n for n in range(len(observations)) if taken[n] >= 0 and weights.planes[n] >= FULL]
+        seen = [n for n in range(len(observations)) if taken[n] >= 0 and weights.planes[n] >= SEEN]
         out = np.zeros((3, len(seen), 2))
         for row, n in enumerate(seen):
             o = observations[n]
-            bias, rates = key_ground_bias(problem.lidars.index(o.lidar)), key_rates(o.drive)
-            factor: Any = ground_plane_factor(
-                (key_vehicle(int(taken[n])), *problem.extrinsic_keys_of(o.lidar)),
-                key_ground(o.drive),
-                ground_centre(problem, o.drive),
-                replace(o, cov=np.eye(3)),
-                key_bias=bias if values.exists(bias) else None,
-                key_rates=rates if values.exists(rates) else None,
-            )
-            tilt = np.array(factor.linearize(values).getb())[:2]
+            centre = ground_centre(problem, o.drive)
+            factor = plane_factor_of(problem, o, int(taken[n]), centre)
+            tilt = factor.unwhitenedError(values)[:2]
             repeated = np.zeros(2) if o.repeated is None else o.repeated[:2]
             out[:, row] = tilt, np.diag(o.cov)[:2], repeated
         lidars = {observations[n].lidar for n in seen}

@@ -163,20 +163,21 @@ class DrivePatches:
         Metres, lidar frame as of the patch's own time. About the plane that fits the *ranges* best:
         directions of beams have no noise, so that it does not turn towards them.
         """
-        u, scatter_m = scatter_of_ranges(self.moments)
+        centres = self.centres_lidar
+        cov = self.moments[:, :3, :3] / self.points[:, None, None]
+        cov = cov - centres[:, :, None] * centres[:, None, :]
+        u, scatter_m = scatter_of_ranges(centres, cov, self.points)
         return np.asarray(u * (scatter_m * np.sqrt(self.points))[:, None])
 
 
-def scatter_of_ranges(moments: Array) -> tuple[Array, Array]:
+def scatter_of_ranges(centres_lidar: Array, cov: Array, points: Array) -> tuple[Array, Array]:
     """Directions (N, 3) of the beams of patches, and (N,) scatter of their ranges, metres.
 
-    About the plane that fits the *ranges* best: directions of beams have no noise. Unbiased.
-    `moments` (N, 4, 4) are about the LiDAR.
+    About the plane that fits the *ranges* best: directions of beams have no noise. Unbiased. Of
+    patches with these middles (N, 3), covariances (N, 3, 3) of their points about them, and numbers
+    of points (N,).
     """
-    points = moments[:, 3, 3]
-    centres = moments[:, :3, 3] / points[:, None]
-    u = centres / np.maximum(np.linalg.norm(centres, axis=1), 1e-9)[:, None]
-    cov = moments[:, :3, :3] / points[:, None, None] - centres[:, :, None] * centres[:, None, :]
+    u = centres_lidar / np.maximum(np.linalg.norm(centres_lidar, axis=1), 1e-9)[:, None]
     across = tangent_axes(u)
     known = across @ cov @ np.swapaxes(across, 1, 2)
     shape = known[:, 0, 0] * known[:, 1, 1] - known[:, 0, 1] * known[:, 1, 0]

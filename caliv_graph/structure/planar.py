@@ -322,7 +322,7 @@ def _judged(
     flat = scatter < MAX_SCATTER * expected
     # A thick group may become flat when it is seen as a part of nothing else: it is decided.
     tilt = np.maximum(scatter, sigma_range_m * cosine) / (width[:, 1] * np.sqrt(count) + 1e-12)
-    u, ranges = scatter_of_ranges(moments)
+    u, ranges = scatter_of_ranges(centre, cov, count)
     along = ranges[:, None] * np.abs(np.einsum("ni,nik->nk", u, axes[:, :, 1:]))
     thick = np.maximum(np.maximum(scatter, 1e-6)[:, None], along)
     broad = (width[:, 1:] > MIN_WIDTH * thick).all(axis=1) & (tilt < MAX_TILT_RAD)

@@ -238,22 +238,33 @@ def _times(
     out = before.copy()
     for k in range(lidars):
         own = lidar == k
-        low, high = 0.0, math.log(MOST_TIMES)
-        for step in range(ROUNDS):
-            middle_times = math.exp(0.5 * (low + high)) if step else 1.0
-            all_of = variances[own] + (middle_times * own_size[own, None]) ** 2
-            share = free[own] * np.clip(1.0 - less[own] / all_of, 0.0, 1.0)
-            if not step and float(share.sum()) < LEAST_TILTS:
-                break
-            # Outliers count as three sigmas.
-            t = float(np.minimum(squares[own] / all_of, 9.0).sum())
-            if t > float(share.sum()):
-                low = math.log(middle_times)
-            else:
-                high = math.log(middle_times)
-        else:
-            out[k] = math.exp(low)
+        sizes = own_size[own, None], variances[own], less[own]
+        out[k] = _times_of_one(squares[own], *sizes, free[own], float(before[k]))
     return out
+
+
+def _times_of_one(
+    squares: Array, size: Array, variances: Array, less: Array, free: Array, before: float
+) -> float:
+    """`_times` of one LiDAR, from its rows of the arrays there."""
+
+    def told(times: float) -> tuple[float, float]:
+        """Squares in their variances, outliers as three sigmas; and what is expected of them."""
+        total = variances + (times * size) ** 2
+        expected = free * np.clip(1.0 - less / total, 0.0, 1.0)
+        return float(np.minimum(squares / total, 9.0).sum()), float(expected.sum())
+
+    found, expected = told(1.0)
+    if expected < LEAST_TILTS:
+        return before
+    if found <= expected:
+        return 1.0
+    low, high = 0.0, math.log(MOST_TIMES)
+    for _ in range(1, ROUNDS):
+        middle = 0.5 * (low + high)
+        found, expected = told(math.exp(middle))
+        low, high = (middle, high) if found > expected else (low, middle)
+    return math.exp(low)
 
 
 def _repeated(known: Array, mean: Array, left: Array, before: Array) -> Array:

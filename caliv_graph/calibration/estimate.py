@@ -63,6 +63,7 @@ from caliv_graph.calibration.structure_evidence import (
 from caliv_graph.common.memory import keeping_larger_arrays
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
+from caliv_graph.errors import RegistrationError, SolveError
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import (
     GroundObservation,
@@ -162,29 +163,23 @@ def _estimate(
     times = {"registration": rough.registration_s, "graph": rough.graph_s}
     whole = _Whole(problem, trajectories, grounds, structure, noise, kept, config)
     solved = _solved(whole, observations, rough.state, told, times, progress)
-    at = solved.state
-    # What the target alone told may have been far off: structure is linearised where all leads.
-    again = far_from(at.structure, at.problem.extrinsics(at.values))
-    normal_rad = None
-    if at.ground_weights is not None and config.noise.ground_normal_deg is None:
-        normal_rad = larger_normal_rad(
-            at.problem, at.grounds, at.ground_weights, at.values, float(noise.floors[0])
-        )
-    if normal_rad is not None:
-        before, noise = noise, noise.with_ground_normal(normal_rad)
-        extrinsics = rough_extrinsics(at)
-        grounds = with_floors(grounds, trajectories, extrinsics, before.floors, noise.floors)
-    if again or normal_rad is not None:
-        # With the LiDARs of the solved graph: its keys are numbered by them.
-        others = lidars_with_structure(at.structure)
-        problem = pose_problem(observations, trajectories, config, noise, others, kept)
-        whole = replace(whole, problem=problem, grounds=grounds, noise=noise)
-        solved = _solved(whole, observations, at, NOTHING_TOLD, times, progress)
+    failed: tuple[str, ...] = ()
+    larger = _for_another_solve(whole, observations, solved.state)
+    if larger is not None:
+        try:
+            solved = _solved(larger, observations, solved.state, NOTHING_TOLD, times, progress)
+            noise = larger.noise
+        except (RegistrationError, SolveError) as error:
+            failed = (
+                f"the solve that begins at the result of the first one failed ({error.what}): the "
+                "result is that of the first, whose sigmas may be too small",
+            )
     if solved.offsets_s is not None:
         rough = replace(rough, offsets_s=solved.offsets_s)
     said = (line for term in solved.state.structure for line in term.warnings)
     solution = solved.solution
-    warnings = (*rough.warnings, *solved.alike, *said, *_unconverged(solution.registrations))
+    unconverged = _unconverged(solution.registrations)
+    warnings = (*rough.warnings, *solved.alike, *said, *unconverged, *failed)
     solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
     return solution, tuple(trajectories)
 
@@ -200,6 +195,32 @@ class _Whole:
     noise: SensorNoise
     kept: Mapping[int, Sequence[int]]
     config: Config
+
+
+def _for_another_solve(
+    whole: _Whole, observations: Sequence[TargetObservation], at: SolveState
+) -> _Whole | None:
+    """What a solve that begins at a solved graph is given; None: nothing asks for one.
+
+    What the target alone told may have been far off: structure is linearised where all leads. And
+    ground planes that scatter more at the result than was estimated have larger sigmas.
+    """
+    grounds, noise, config = whole.grounds, whole.noise, whole.config
+    normal_rad = None
+    if at.ground_weights is not None and config.noise.ground_normal_deg is None:
+        normal_rad = larger_normal_rad(
+            at.problem, at.grounds, at.ground_weights, at.values, float(noise.floors[0])
+        )
+    if normal_rad is not None:
+        noise = noise.with_ground_normal(normal_rad)
+        floors = whole.noise.floors, noise.floors
+        grounds = with_floors(grounds, whole.trajectories, rough_extrinsics(at), *floors)
+    elif not far_from(at.structure, at.problem.extrinsics(at.values)):
+        return None
+    # With the LiDARs of the solved graph: its keys are numbered by them.
+    others = lidars_with_structure(at.structure)
+    problem = pose_problem(observations, whole.trajectories, config, noise, others, whole.kept)
+    return replace(whole, problem=problem, grounds=grounds, noise=noise)
 
 
 @dataclass(frozen=True)

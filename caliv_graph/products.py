@@ -922,6 +922,7 @@ class Calibration:
         earlier: data terms of earlier drives that served as a prior. They are part of the
             extrinsics and of `cov_joint`, not of `information_data`.
         contradictions: a sentence each; with any the status is inconsistent.
+        warnings: what else a person should know of the result, a sentence each.
         suspects: inputs that could be wrong, the one that explains most first; empty: not tested.
         vehicle: `lever_arm`, `imu_rotation`, `wheels_rotation`, `speed_scale` and `heading_yaw`,
             where they were estimated.
@@ -940,6 +941,7 @@ class Calibration:
     gradient_data: Array | None = None
     earlier: tuple[DataTerm, ...] = ()
     contradictions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     suspects: tuple[Suspect, ...] = ()
     vehicle: Mapping[str, VehicleParameter] = field(default_factory=dict)
     structure: StructureSummary | None = None

@@ -125,7 +125,7 @@ def perform(task: Task) -> dict[str, Any]:
         line |= {"exit": DEFECT, "said": [traceback.format_exc()]}
     else:
         line |= outcome_of(run.calibration, recording.truth.T_vehicle_lidar)
-        line["warnings"] = list(run.warnings)
+        line["warnings"] = list(run.calibration.warnings)
     return {**line, "cpu_s": time.process_time() - begun}
 
 

@@ -220,7 +220,7 @@ def _calibrated(recording: SimulatedRecording, config: Config) -> dict[str, Any]
     )
     return {
         "place": done.observations[0].centre_map[:2].tolist(),
-        "said": "; ".join((done.observations[0].name, *done.warnings)),
+        "said": "; ".join((done.observations[0].name, *done.calibration.warnings)),
         "contradictions": list(done.calibration.contradictions),
         "exit": exit_code(done.calibration),
         "worst_sigma": round(worst, 1),

@@ -148,12 +148,12 @@ def test_views_that_are_not_shared_leave_lidars_undetermined_against_each_other(
 
 def test_a_person_is_told() -> None:
     _, run = shared()
-    (line,) = (w for w in run.warnings if "moved" in w)
+    (line,) = (w for w in run.calibration.warnings if "moved" in w)
     assert line == (
         "target: it was moved while the vehicle stood: 3 places, each solved for by itself: "
         "2 seen by 'front' and 'left', 1 seen by 'front' alone"
     )
-    (line,) = (w for w in unshared().warnings if "moved" in w)
+    (line,) = (w for w in unshared().calibration.warnings if "moved" in w)
     assert "2 places" in line
     assert "No placement is shared, so S2S is unobservable: put it where two LiDARs see it" in line
 

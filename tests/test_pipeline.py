@@ -187,7 +187,7 @@ def test_a_drum_is_named_and_turns_about_it_are_forgotten(tmp_path: Path) -> Non
     world = scenario.world.model_copy(update={"objects": objects})
     drive = simulated(scenario.model_copy(update={"world": world}), 1, tmp_path / "drive")
     tried = try_out(drive.asked(registration=MEDIUM))
-    assert any("looks the same after any turn" in w for w in tried.run.warnings)
+    assert any("looks the same after any turn" in w for w in tried.run.calibration.warnings)
     # Poses that are exact tell the rest; what noise seems to say of turns is not among it.
     assert tried.nees() < 20.0
     assert np.abs(tried.s2s()[3:]).max() < 10.0 * MM
@@ -405,7 +405,7 @@ def test_a_lidar_that_never_sees_the_target_stays_where_it_was_guessed(four: Tri
     assert not calibration.information_data[rows].any()
     assert not calibration.cov_joint[rows, :18].any()
     assert calibration.unmet == ("lidar 'right' never saw the target",)
-    assert any("'right'" in warning for warning in four.run.warnings)
+    assert any("'right'" in warning for warning in four.run.calibration.warnings)
 
 
 # ------------------------------------------------------------------ what changes nothing

@@ -149,7 +149,7 @@ def test_a_mount_that_was_knocked_since_is_found(arcs: TwoArcs) -> None:
     result = calibrated(arcs.left, prior=before)
 
     assert result.calibration.status == "inconsistent"
-    assert any("LiDAR 'rear' has moved" in warning for warning in result.warnings)
+    assert any("LiDAR 'rear' has moved" in warning for warning in result.calibration.warnings)
 
 
 def test_a_trusted_mounting_is_not_data(arcs: TwoArcs) -> None:

@@ -108,8 +108,8 @@ def test_without_a_target_structure_calibrates_alone(tmp_path: Path) -> None:
         assert all(lidar.determined.values())
     assert run.solution.registrations == ()
     assert run.solution.converged
-    assert "a hedge was left out" in run.warnings
-    assert not any("target" in line for line in run.warnings)
+    assert "a hedge was left out" in run.calibration.warnings
+    assert not any("target" in line for line in run.calibration.warnings)
     # The ground takes part, at the poses that were kept.
     assert run.record is not None
     assert {g.lidar for g in run.record.grounds} == set(drive.config.lidars)
@@ -121,7 +121,7 @@ def test_without_a_target_structure_calibrates_alone(tmp_path: Path) -> None:
 def check_files(run: CalibrationRun, drive: ChairDrive, folder: Path) -> None:
     """Everything that is written and read without a target."""
     result = run.calibration
-    write_result(folder, result, run.solution, drive.config, [], run.warnings, run.record)
+    write_result(folder, result, run.solution, drive.config, [], result.warnings, run.record)
     again = read_calibration(folder / "calibration.yaml")
     assert again.structure == result.structure
     assert again.structure is not None
@@ -183,7 +183,8 @@ def test_where_none_is_found_a_warning_says_so(
 
     run = run_on(drive)
 
-    assert any("without a target" in w and "no object stands still" in w for w in run.warnings)
+    said = run.calibration.warnings
+    assert any("without a target" in w and "no object stands still" in w for w in said)
     assert run.calibration.status == "ok"
 
     # Structure that tells nothing: the error names both.

@@ -165,7 +165,7 @@ def run_job(
         warnings=(
             *_unused_keys(config),
             *calibration.contradictions,
-            *run.warnings,
+            *calibration.warnings,
             *calibration.unmet,
         ),
     )

@@ -112,6 +112,8 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
         ),
         *_differing_guesses(calibrations, calibration),
     ]
+    before = (said for c in calibrations.values() for said in c.warnings)
+    calibration = replace(calibration, warnings=tuple(dict.fromkeys([*before, *warnings])))
     return Merger(calibration, agreement, tuple(warnings))
 
 
@@ -199,7 +201,7 @@ def with_earlier(
 
     Returns:
         The calibration, and warnings. It is `inconsistent` if a mount has moved since, or if one of
-        the two is; it has the contradictions of both.
+        the two is; it has the contradictions and warnings of both.
     """
     own = own_term(calibration, "this drive")
     terms = prior_terms(prior)
@@ -216,10 +218,8 @@ def with_earlier(
     draft = replace(
         calibration,
         earlier=terms,
-        contradictions=(
-            *calibration.contradictions,
-            *(f"{_OF_PRIOR}{said.removeprefix(_OF_PRIOR)}" for said in prior.contradictions),
-        ),
+        contradictions=(*calibration.contradictions, *_as_of_prior(prior.contradictions)),
+        warnings=(*calibration.warnings, *_as_of_prior(prior.warnings)),
         provenance={**calibration.provenance, _PRIOR: dict(prior.provenance)},
     )
     disagree = comparison.moved or "inconsistent" in (calibration.status, prior.status)
@@ -236,6 +236,11 @@ def with_earlier(
         )
     result = _assembled(draft, calibration.lidars, guesses, fused, data, disagree)
     return result, tuple(warnings)
+
+
+def _as_of_prior(said: Sequence[str]) -> tuple[str, ...]:
+    """Sentences of an earlier calibration, marked as such."""
+    return tuple(f"{_OF_PRIOR}{sentence.removeprefix(_OF_PRIOR)}" for sentence in said)
 
 
 def _assembled(

@@ -122,14 +122,16 @@ def _calibrate(
         calibration, conflicts = with_prior(calibration, prior, config)
 
     doubts = (*doubts, *warnings_of(clocks))
-    warnings = (*notes, *prepared.warnings, *solution.warnings, *doubts, *conflicts)
+    of_prior = calibration.warnings
+    warnings = (*notes, *prepared.warnings, *solution.warnings, *doubts, *conflicts, *of_prior)
     record = RunRecord(
         drives=tuple(Path(recording.name).absolute().name for recording in recordings),
         trajectories=trajectories,
         grounds=prepared.grounds,
         scene={drive: recording.kept() for drive, recording in enumerate(sampled)},
     )
-    return CalibrationRun(calibration, solution, prepared.observations, warnings, record)
+    calibration = replace(calibration, warnings=tuple(dict.fromkeys(warnings)))
+    return CalibrationRun(calibration, solution, prepared.observations, record)
 
 
 def structure_evidence(prepared: Prepared) -> StructureEvidence:

@@ -75,6 +75,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "reference": calibration.reference,
         "unmet": list(calibration.unmet),
         "contradictions": list(calibration.contradictions),
+        "warnings": list(calibration.warnings),
         **_suspect_documents(calibration),
         "lidars": {name: _lidar_document(result) for name, result in calibration.lidars.items()},
         "sensor_to_sensor": [

@@ -258,6 +258,7 @@ class CalibrationModel(Part):
     sensor_to_sensor: list[_PairPart] | None = None
     unmet: tuple[Text, ...] = ()
     contradictions: tuple[Text, ...] = ()
+    warnings: tuple[Text, ...] = ()
     suspects: tuple[_SuspectPart, ...] = ()
     provenance: dict[Text, Any] = Field({})
     vehicle: VehiclePart = VehiclePart()
@@ -304,6 +305,7 @@ class CalibrationModel(Part):
             weak=tuple(d.read(poses) for d in self.observability.weak),
             unmet=self.unmet,
             contradictions=self.contradictions,
+            warnings=self.warnings,
             suspects=tuple(part.suspect() for part in self.suspects),
             provenance=self.provenance,
             gradient_data=None if gradient is None else np.array(gradient),

@@ -40,5 +40,4 @@ class CalibrationRun:
     calibration: Calibration
     solution: Solution
     observations: tuple[TargetObservation, ...]
-    warnings: tuple[str, ...]
     record: RunRecord | None = None

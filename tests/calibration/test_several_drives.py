@@ -167,7 +167,7 @@ def test_a_lidar_that_is_missing_in_a_drive_is_told_and_solved_from_the_others()
 
     drives: list[Recording] = [three, Without(left())]
     run = calibrate(drives, config(three, left()), SilentProgress())
-    assert any("'side' has no scans in this drive" in line for line in run.warnings)
+    assert any("'side' has no scans in this drive" in line for line in run.calibration.warnings)
     # Tied to the others by the first drive, and through them to the vehicle by both.
     assert run.calibration.undetermined == ()
     errors = evaluate(run.calibration, three.truth.T_vehicle_lidar)

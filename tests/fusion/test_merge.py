@@ -515,15 +515,22 @@ def test_a_mount_that_moved_since_the_prior() -> None:
 def test_a_prior_that_is_inconsistent_makes_the_result_so(tmp_path: Path) -> None:
     before, alone = two_drives()
     before = replace(before, status="inconsistent", contradictions=("stamps are late",))
+    before = replace(before, warnings=("one scan counts less",))
+    alone = replace(alone, warnings=("no IMU",))
 
     result, (warning,) = with_earlier(replace(alone, contradictions=("a cloud is off",)), before)
 
+    assert result.warnings == ("no IMU", "--prior: one scan counts less")
+    both = merged(before, alone)
+    assert both.warnings[:2] == ("one scan counts less", "no IMU")
+    assert "is inconsistent, so the merged" in both.warnings[2]
     assert merged(before, alone).status == result.status == "inconsistent"
     assert warning.startswith("--prior: is inconsistent")
     assert result.contradictions == ("a cloud is off", "--prior: stamps are late")
     write_calibration(result, tmp_path / "b.yaml")
     third = drive(information(NAMES, 5), source="c")
     handed_on, _ = with_earlier(third, read_calibration(tmp_path / "b.yaml"))
+    assert handed_on.warnings == ("--prior: no IMU", "--prior: one scan counts less")
     assert handed_on.status == "inconsistent"
     assert handed_on.contradictions == ("--prior: a cloud is off", "--prior: stamps are late")
 

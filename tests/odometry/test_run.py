@@ -77,7 +77,7 @@ def test_the_vehicle_is_known_by_ground_and_course_alone() -> None:
     assert len(together) == 2
     assert all("record an IMU" in direction.remedy for direction in together)
     assert "odometry of lidar 'a'" in str(calibration.provenance["motion"])
-    assert calibrated().warnings[0].startswith("no motion data")
+    assert calibrated().calibration.warnings[0].startswith("no motion data")
 
 
 def test_what_a_user_asks_of_the_vehicle_is_not_promised() -> None:

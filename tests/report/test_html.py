@@ -69,7 +69,12 @@ class Ran:
         calibration = replace(run.calibration, **changes)
         assert run.record is not None
         return render_report(
-            calibration, run.solution, self.config, self.stages, run.warnings, run.record
+            calibration,
+            run.solution,
+            self.config,
+            self.stages,
+            run.calibration.warnings,
+            run.record,
         )
 
     def log(self) -> list[dict[str, Any]]:
@@ -80,7 +85,7 @@ class Ran:
                 run.solution,
                 self.config.robust,
                 self.stages,
-                run.warnings,
+                run.calibration.warnings,
                 run.record,
             )
         )
@@ -447,7 +452,7 @@ def test_a_line_per_stage_and_finding(bag: Ran) -> None:
     (result,) = (line for line in lines if "result" in line)
     assert result["not_determined"]["front"] == ["yaw", "x"]
     assert result["not_determined"][EVIL] == list(AXES)
-    assert about.count("warning") == len(bag.run.warnings) > 0
+    assert about.count("warning") == len(bag.run.calibration.warnings) > 0
     kinds = [line["residuals"] for line in lines if "residuals" in line]
     assert bag.run.record is not None
     assert kinds == [r.kind for r in all_residuals(bag.run.solution, bag.run.record)]
@@ -461,7 +466,7 @@ def test_both_are_among_the_files_of_a_result(staged: Ran, tmp_path: Path) -> No
         run.solution,
         staged.config,
         staged.stages,
-        run.warnings,
+        run.calibration.warnings,
         run.record,
     )
 

@@ -81,11 +81,12 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         make_calibration("front", "left", "rear", status="ok", unmet=("s2v: yaw",), weak=(weak,)),
         "left",
     )
+    calibration = replace(calibration, warnings=("2 scans are missing: wait",))
     write_calibration(calibration, tmp_path / "calibration.yaml")
 
     back = read_calibration(tmp_path / "calibration.yaml")
 
-    for field in ("status", "reference", "unmet", "provenance"):
+    for field in ("status", "reference", "unmet", "warnings", "provenance"):
         assert getattr(back, field) == getattr(calibration, field)
     assert list(back.lidars) == ["front", "left", "rear"]
     for name, result in calibration.lidars.items():

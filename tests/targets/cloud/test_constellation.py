@@ -15,7 +15,7 @@ from caliv_graph.common.exits import DONE, exit_code
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.lidars import LidarConfig, PoseSigmaConfig
 from caliv_graph.config.load import load_config, parse_config
-from caliv_graph.config.model import Config, TargetRegion
+from caliv_graph.config.model import Config, RegistrationConfig, TargetRegion
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array, LidarScan, TargetCloud, TargetObservation
@@ -455,7 +455,8 @@ def test_two_objects_of_a_figure_eight_are_two_placements() -> None:
 
 @cache
 def edgar(name: str) -> CalibrationRun:
-    config = load_config(EDGAR / name)
+    coarse = RegistrationConfig(components=400, max_points=400)
+    config = load_config(EDGAR / name).model_copy(update={"registration": coarse})
     return calibrate([open_recording(config)], config, SilentProgress())
 
 

@@ -37,13 +37,15 @@ def few_clouds() -> Scenario:
     assert scenario.crop is not None
     crop = scenario.crop.model_copy(update={"elsewhere_stride": 32})
     drive = scenario.drive.model_copy(update={"speed_m_s": SPEED_M_S, "radius_m": RADIUS_M})
-    return scenario.model_copy(update={"drive": drive, "lidars": lidars, "crop": crop})
+    imu = scenario.imu.model_copy(update={"rate_hz": 50.0})
+    changes = {"drive": drive, "lidars": lidars, "crop": crop, "imu": imu}
+    return scenario.model_copy(update=changes)
 
 
 def quick_config(drive: KeptDrive, has_bag: bool) -> Config:
     """Few components and scans, no structure."""
     raw = config_of(drive, has_bag)
-    raw["registration"] = {"components": 150, "max_points": 120}
+    raw["registration"] = {"components": 100, "max_points": 100}
     raw["extraction"] = {"max_scans": 16}
     return without_structure(parse_config(raw, "config.yaml", Path("/nowhere")))
 

@@ -18,7 +18,7 @@ from caliv_graph.products import Array
 from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.drive_models import StandstillDrive
 from caliv_graph.scenario.model import CropModel, Scenario, load_scenario
-from caliv_graph.scenario.sensor_models import LidarModel
+from caliv_graph.scenario.sensor_models import ImuModel, LidarModel
 from caliv_graph.scenario.world_models import ChairModel, MoveModel, WorldModel
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
 from caliv_graph.simulation.writer import config_of
@@ -71,10 +71,11 @@ def standing(*places: tuple[float, float, float], phase_s: float = 0.0, seed: in
         lidars={"front": lidar(2.0, 0.0, 0.0, 0.0), "left": lidar(1.0, 0.8, 70.0, phase_s)},
         world=WorldModel(objects={"chair": chair}, targets=("chair",), region_margin_m=1.0),
         crop=CropModel(margin_m=0.3, elsewhere_stride=10),
+        imu=ImuModel(rate_hz=50.0),
     )
     recording = KeptDrive(scenario, seed)
     raw = config_of(recording, has_bag=True)
-    raw |= {"registration": {"components": 200, "max_points": 160}}
+    raw |= {"registration": {"components": 150, "max_points": 120}}
     # The simulated ranges have no bias; one of some millimetres, which real ones may have, would
     # leave the yaw of LiDARs that stand still to 2 mrad.
     raw |= {"noise": {**raw.get("noise", {}), "lidar_range_bias_m": 0.001}}

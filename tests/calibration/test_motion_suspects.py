@@ -21,7 +21,7 @@ from tests.trajectory.motions import Course, config_for, eight_drive, mounted_as
 from tests.trajectory.test_wheels import ANTENNA, wheels
 
 COURSE = Course(eight_drive(14.0), rough=1.0)
-SENSORS = mounted_askew()
+SENSORS = replace(mounted_askew(), imu_hz=50.0)
 WANTED = stamps(14.0, 2.0, 0.0512)
 CONFIG = config_for(SENSORS)
 

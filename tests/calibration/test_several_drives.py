@@ -20,7 +20,7 @@ from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.results.run import CalibrationRun
 from caliv_graph.scenario.drive_models import ArcDrive
 from caliv_graph.scenario.model import CropModel, Scenario
-from caliv_graph.scenario.sensor_models import GnssModel, LidarModel
+from caliv_graph.scenario.sensor_models import GnssModel, ImuModel, LidarModel
 from caliv_graph.scenario.world_models import ChairModel, GroundModel, ObjectModel, WorldModel
 from caliv_graph.simulation.recording import SimulatedRecording
 from caliv_graph.simulation.writer import config_of
@@ -72,6 +72,7 @@ def scenario(
             region_margin_m=1.5,
         ),
         gnss=GnssModel(latitude_deg=datum_deg),
+        imu=ImuModel(rate_hz=50.0),
         crop=CropModel(margin_m=0.5, elsewhere_stride=10),
     )
 
@@ -92,7 +93,7 @@ def config(*recordings: SimulatedRecording, use: tuple[str, ...] = ()) -> Config
     raw = config_of(recordings[0], has_bag=True)
     # Of each drive its regions: what is in no region of a drive is nobody's target there.
     raw["target"] = [r for one in recordings for r in config_of(one, has_bag=True)["target"]]
-    raw |= {"registration": {"components": 150, "max_points": 120}}
+    raw |= {"registration": {"components": 100, "max_points": 100}}
     raw["extraction"] = {"max_scans": 12}
     raw["require"] = []
     # The simulated errors of the fixes and of the orientation are white: nothing to look for.

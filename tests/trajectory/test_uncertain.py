@@ -30,7 +30,7 @@ from tests.trajectory.motions import (
 )
 
 COURSE = Course(eight_drive(24.0), rough=1.0)
-SENSORS = replace(mounted_askew(), twist_hz=20.0, twist_delay_s=0.017)
+SENSORS = replace(mounted_askew(), imu_hz=50.0, twist_hz=20.0, twist_delay_s=0.017)
 WANTED = stamps(24.0, 2.0, 0.0512)
 
 

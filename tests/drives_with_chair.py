@@ -53,7 +53,7 @@ FIGURE_EIGHT = FigureEightDrive(radius_m=RADIUS_M)
 STRAIGHT = StraightDrive(duration_s=17.0)
 STANDSTILL = StandstillDrive(duration_s=17.0)
 
-QUICK = RegistrationConfig(components=200, max_points=160)
+QUICK = RegistrationConfig(components=120, max_points=120)
 """A coarse registration in half the time, for what does not depend on how fine it is."""
 
 RAMP_HEIGHT_M = 1.6

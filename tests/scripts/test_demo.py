@@ -42,7 +42,7 @@ def in_this_process(line: Sequence[str | Path], check: bool) -> SimpleNamespace:
     if line[1] == "calibrate":
         config = Path(line[2])
         document = yaml.safe_load(config.read_text(encoding="utf-8"))
-        document["registration"] = {"components": 150, "max_points": 120}
+        document["registration"] = {"components": 100, "max_points": 80}
         config.write_text(yaml.safe_dump(document), encoding="utf-8")
     return SimpleNamespace(returncode=main.run([str(argument) for argument in line[1:]]))
 

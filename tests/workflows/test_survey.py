@@ -58,7 +58,7 @@ def scenario_of(name: str) -> Scenario:
     return scenario.model_copy(update={"crop": crop})
 
 
-QUICK = RegistrationConfig(max_points=160, components=200)
+QUICK = RegistrationConfig(max_points=120, components=120)
 """A registration that costs less: millimetres change nothing of what a drive determines."""
 
 

@@ -25,10 +25,10 @@ from tests.drives_with_chair import FIGURE_EIGHT, QUICK, ChairDrive, paper_scena
 
 @cache
 def eight() -> ChairDrive:
-    """A figure-eight with clouds at 1.25 Hz and good poses."""
+    """A figure-eight with clouds at 1 Hz and good poses."""
     with TemporaryDirectory() as folder:
         scenario = paper_scenario(
-            FIGURE_EIGHT, rate_hz=1.25, position_sigma_m=2e-3, rotation_sigma_rad=2e-4
+            FIGURE_EIGHT, rate_hz=1.0, position_sigma_m=2e-3, rotation_sigma_rad=2e-4
         )
         return simulated(scenario, 1, Path(folder)).asked(registration=QUICK)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -92,7 +92,7 @@ def structure_terms(
     del priors
     for own, kept, trajectory in zip(patches, kept_ns, trajectories, strict=True):
         prior = left.pop(0)
-        used = usable(own, trajectory, start, config)
+        used = usable(own, trajectory, start, config, held)
         if not len(used.scan):
             continue
         used = used.followed(start)
@@ -145,14 +145,16 @@ def usable(
     trajectory: VehicleTrajectory,
     T_vehicle_lidar: Mapping[str, gtsam.Pose3],
     config: Config,
+    placed: Collection[str] = (),
 ) -> DrivePatches:
     """The patches without those of the ground of LiDARs for whose ground the strips do not stand.
 
-    Of none they do where the config does without the ground.
+    Of none they do where the config does without the ground. `placed` are LiDARs that a target has
+    placed.
     """
     standing = np.zeros(len(patches.lidars), dtype=bool)
     if config.ground.use:
-        standing = lidars_above_ground(patches, trajectory, T_vehicle_lidar)
+        standing = lidars_above_ground(patches, trajectory, T_vehicle_lidar, placed)
     if standing.all():
         return patches
     is_level = level(patches, trajectory, T_vehicle_lidar)

@@ -256,6 +256,24 @@ def test_strips_stand_for_the_ground_only_of_lidars_that_see_it_at_no_grazing_an
     np.testing.assert_array_equal(lidars_above_ground(nothing, TRAJECTORY, TRUTH), [True, True])
 
 
+def test_strips_stand_for_the_ground_of_a_placed_lidar_only_if_it_sees_several_pieces() -> None:
+    """Of three in a scan the middles have a plane; of fewer only the tilts are known."""
+    patches = in_yard()
+    of, scans = patches.scan_lidar[patches.scan], int(np.sum(patches.scan_lidar == 1))
+    own = np.flatnonzero(level(patches, TRAJECTORY, TRUTH) & (of == 1))
+    first, second = patches.lidars
+    for each, standing in ((4, True), (2, False)):
+        kept = np.ones(len(of), dtype=bool)
+        kept[own] = False
+        kept[own[np.linspace(0, len(own) - 1, each * scans).astype(int)]] = True
+        few = patches.part(kept)
+        found = lidars_above_ground(few, TRAJECTORY, TRUTH, (second,))
+        np.testing.assert_array_equal(found, [True, standing])
+        # Without a target a plane alone would not place it.
+        found = lidars_above_ground(few, TRAJECTORY, TRUTH, (first,))
+        np.testing.assert_array_equal(found, [True, True])
+
+
 def test_level_patches_at_the_limit_of_incidence_are_left_to_the_ground_planes() -> None:
     patches, config = in_yard(), Config(lidars={n: LidarConfig(topic=n) for n in SPINNERS})
     assert usable(patches, TRAJECTORY, TRUTH, config) is patches

@@ -16,9 +16,10 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
 from caliv_graph.calibration.given_noise import noise_by_structure
+from caliv_graph.calibration.ground import GroundWeights
 from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.ground_floors import with_floors
-from caliv_graph.calibration.ground_scatter import larger_normal_rad
+from caliv_graph.calibration.ground_scatter import GroundLevels, larger_levels
 from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.no_target import (
     solution_without_target,
@@ -206,13 +207,9 @@ def _for_another_solve(
     ground planes that scatter more at the result than was estimated have larger sigmas.
     """
     grounds, noise, config = whole.grounds, whole.noise, whole.config
-    normal_rad = None
-    if at.ground_weights is not None and config.noise.ground_normal_deg is None:
-        normal_rad = larger_normal_rad(
-            at.problem, at.grounds, at.ground_weights, at.values, float(noise.floors[0])
-        )
-    if normal_rad is not None:
-        noise = noise.with_ground_normal(normal_rad)
+    larger = None if at.ground_weights is None else _larger_levels(at, at.ground_weights)
+    if larger is not None:
+        noise = noise.with_ground_levels(larger)
         floors = whole.noise.floors, noise.floors
         grounds = with_floors(grounds, whole.trajectories, rough_extrinsics(at), *floors)
     elif not far_from(at.structure, at.problem.extrinsics(at.values)):
@@ -221,6 +218,23 @@ def _for_another_solve(
     others = lidars_with_structure(at.structure)
     problem = pose_problem(observations, whole.trajectories, config, noise, others, whole.kept)
     return replace(whole, problem=problem, grounds=grounds, noise=noise)
+
+
+def _larger_levels(at: SolveState, weights: GroundWeights) -> GroundLevels | None:
+    """Levels of ground and heave that a solved graph asks for; None: those that it has.
+
+    What the config states is held.
+    """
+    problem, noise, ground = at.problem, at.config.noise, at.config.ground
+    asked = larger_levels(problem, at.grounds, weights, at.values, ground.vehicle_height)
+    normal_rad, _, distance_m = problem.floors.tolist()
+    before = GroundLevels(normal_rad, distance_m, problem.heave_m)
+    larger = GroundLevels(
+        asked.normal_rad if noise.ground_normal_deg is None else normal_rad,
+        asked.distance_m if noise.ground_distance_m is None else distance_m,
+        asked.heave_m if noise.heave_m is None else problem.heave_m,
+    )
+    return None if larger == before else larger
 
 
 @dataclass(frozen=True)

@@ -200,8 +200,16 @@ def ground_graph(
 def _waves_below(problem: Problem, stands: Array) -> Array:
     """(m, 2) 1 sigma of tilt and height of the ground below each pose against its drive's plane.
 
-    Waves stay where they are, as for scans of the ground (`ground_floors.sharing_scans`): poses of
-    one place know them once, and each counts for its part. `stands` (m,) are weights.
+    Poses of one place know them once, and each counts for its part. `stands` (m,) are weights.
+    """
+    shares = standing_shares(problem, stands)
+    return np.sqrt(shares)[:, None] * problem.floors[[0, 2]]
+
+
+def standing_shares(problem: Problem, stands: Array) -> Array:
+    """(m,) how many poses share the ground below each, itself too; `stands` (m,) are weights.
+
+    Waves stay where they are, as for scans of the ground (`ground_floors.sharing_scans`).
     """
     shares = np.ones(len(stands))
     of_drive = problem.drives()
@@ -209,7 +217,7 @@ def _waves_below(problem: Problem, stands: Array) -> Array:
         own = np.flatnonzero((of_drive == drive) & (stands > 0.0))
         places = [problem.T_map_vehicle[i].translation() for i in own.tolist()]
         shares[own] = sharing_places(np.array(places).reshape(-1, 3), stands[own])
-    return np.sqrt(shares)[:, None] * problem.floors[[0, 2]]
+    return shares
 
 
 def plane_factor_of(

@@ -1,4 +1,4 @@
-"""Waves of the ground, as far as its planes scatter at a solution."""
+"""Waves of the ground and heave, as far as planes and stands scatter at a solution."""
 
 from __future__ import annotations
 
@@ -14,93 +14,147 @@ from caliv_graph.calibration.ground import (
     GroundWeights,
     ground_centre,
     plane_factor_of,
+    standing_shares,
     taken_poses,
 )
+from caliv_graph.calibration.ground_factors import height_over
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.conventions import key_ground, key_height, key_vehicle
 from caliv_graph.products import Array, GroundObservation
 
 FEWEST_PLANES = 8
-"""Planes, and tilts beyond those that are fitted, at least: a variance to a half."""
+"""Planes, and residuals beyond what is fitted, at least: a variance to a half."""
 
 LARGEST_RATIO, CHANCE = 1.5, 1e-3
-"""Mean square of tilts in their variance from which they do, unless by chance."""
+"""Mean square of residuals in their variance from which they do, unless by chance."""
 
 ROUNDS = 40
 """Halvings of the interval in which the variance is looked for."""
 
 
-def larger_normal_rad(
+@dataclass(frozen=True)
+class GroundLevels:
+    """1 sigma of what moves ground planes and stands from scan to scan.
+
+    Attributes:
+        normal_rad: tilt of a plane by waves of the ground.
+        distance_m: its distance, likewise.
+        heave_m: heave of the body.
+    """
+
+    normal_rad: float
+    distance_m: float
+    heave_m: float
+
+
+def larger_levels(
     problem: Problem,
     observations: Sequence[GroundObservation],
     weights: GroundWeights,
     values: gtsam.Values,
-    normal_rad: float,
-) -> float | None:
-    """1 sigma of the tilt of ground planes by waves that a solution asks for; None: no larger one.
+    height_m: float | None,
+) -> GroundLevels:
+    """The levels that a solution asks for: those of the problem, or larger ones.
 
     Before it, few planes tell: of seven, known to 2 mrad with the tilt that all share, waves of 0.1
-    mrad were as likely as of 0.4, and S2S roll was off by ten sigmas. Here all LiDARs agree on one
-    ground. Planes that scatter more than their sigmas say, `normal_rad` included, do so by waves.
-    `values` is the solution, `weights` are the robust ones of the observations there.
+    mrad were as likely as of 0.4, and S2S roll was off by ten sigmas. Those beside the target
+    alone had heave and distance of 0.4 mm, where the ground of the drive has waves of 14 mm. Here
+    all LiDARs agree on one ground, all along the drive. What scatters more than its sigmas say does
+    so by waves and heave. `values` is the solution, `weights` are the robust ones of the
+    observations there, `height_m` is that of the vehicle frame (None: it stands on no plane).
     """
-    planes = _Planes.of(problem, observations, weights, values)
-    tilts, variances = planes.tilts, planes.variances
-    free = tilts.size - planes.fitted
-    if len(tilts) < FEWEST_PLANES or free < FEWEST_PLANES:
-        return None
-
-    def squares(more: float) -> float:
-        # Outliers count as three sigmas.
-        return float(np.minimum(tilts**2 / (variances + more), 9.0).sum())
-
-    ratio = squares(0.0) / free
-    # Waves that scans share are as many as there are places; noise of the points is of each scan.
-    apart = free / float(np.mean(1.0 + planes.repeated * normal_rad**2 / variances**2))
-    if ratio < LARGEST_RATIO or chdtrc(apart, ratio * apart) > CHANCE:
-        return None
-    low, high = 0.0, float(np.max(tilts**2))
-    for _ in range(ROUNDS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if squares(middle) > free else (low, middle)
-    return float(np.sqrt(normal_rad**2 + high))
+    normal_rad, _, distance_m = problem.floors.tolist()
+    tilts, distances = _of_planes(problem, observations, weights, values)
+    heave_m = problem.heave_m
+    if height_m is not None:
+        stands = _of_stands(problem, weights, values, height_m)
+        heave_m = stands.larger(heave_m)
+    return GroundLevels(tilts.larger(normal_rad), distances.larger(distance_m), heave_m)
 
 
 @dataclass(frozen=True)
-class _Planes:
-    """Planes in use at a solution.
+class _Scatter:
+    """Residuals of one kind at a solution.
 
     Attributes:
-        tilts: (n, 2) to the ground, rad, without what biases of the ranges do to them.
-        variances: (n, 2) of these.
-        repeated: (n, 2) `GroundObservation.repeated`: that of waves, by the other scans of a place.
-        fitted: number of tilts that the solution is fitted to.
+        residuals: (n, k).
+        variances: (n, k) of these.
+        repeated: (n, k) of them what other scans of a place have in common, times their number.
+        fitted: number of coordinates that the solution is fitted to.
     """
 
-    tilts: Array
+    residuals: Array
     variances: Array
     repeated: Array
     fitted: int
 
-    @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        observations: Sequence[GroundObservation],
-        weights: GroundWeights,
-        values: gtsam.Values,
-    ) -> _Planes:
-        """Of those among the observations whose pose the problem has."""
-        taken = taken_poses(problem, observations)
-        seen = [n for n in range(len(observations)) if taken[n] >= 0 and weights.planes[n] >= SEEN]
-        out = np.zeros((3, len(seen), 2))
-        for row, n in enumerate(seen):
-            o = observations[n]
-            centre = ground_centre(problem, o.drive)
-            factor = plane_factor_of(problem, o, int(taken[n]), centre)
-            tilt = factor.unwhitenedError(values)[:2]
-            repeated = np.zeros(2) if o.repeated is None else o.repeated[:2]
-            out[:, row] = tilt, np.diag(o.cov)[:2], repeated
-        lidars = {observations[n].lidar for n in seen}
-        drives = {observations[n].drive for n in seen}
-        tilts, variances, repeated = out
-        return cls(tilts, variances, repeated, 2 * (len(lidars) + len(drives)))
+    def larger(self, sigma: float) -> float:
+        """Of a level that is in the variances with this sigma, the one that they ask for."""
+        free = self.residuals.size - self.fitted
+        if len(self.residuals) < FEWEST_PLANES or free < FEWEST_PLANES:
+            return sigma
+        ratio = self._squares(0.0) / free
+        # Waves that scans share are as many as there are places; noise of the points is of each
+        # scan.
+        apart = free / float(np.mean(1.0 + self.repeated / self.variances**2))
+        if ratio < LARGEST_RATIO or chdtrc(apart, ratio * apart) > CHANCE:
+            return sigma
+        low, high = 0.0, float(np.max(self.residuals**2))
+        for _ in range(ROUNDS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._squares(middle) > free else (low, middle)
+        return float(np.sqrt(sigma**2 + high))
+
+    def _squares(self, more: float) -> float:
+        """Sum of squares in variances that are larger by `more`; outliers are three sigmas off."""
+        return float(np.minimum(self.residuals**2 / (self.variances + more), 9.0).sum())
+
+
+def _of_planes(
+    problem: Problem,
+    observations: Sequence[GroundObservation],
+    weights: GroundWeights,
+    values: gtsam.Values,
+) -> tuple[_Scatter, _Scatter]:
+    """Tilts (n, 2) and distances (n, 1) of the planes in use whose pose the problem has.
+
+    Without what biases of the ranges do to them.
+    """
+    taken = taken_poses(problem, observations)
+    seen = [n for n in range(len(observations)) if taken[n] >= 0 and weights.planes[n] >= SEEN]
+    residuals, variances, repeated = np.zeros((3, len(seen), 3))
+    for row, n in enumerate(seen):
+        o = observations[n]
+        centre = ground_centre(problem, o.drive)
+        factor = plane_factor_of(problem, o, int(taken[n]), centre)
+        residuals[row] = factor.unwhitenedError(values)
+        variances[row] = np.diag(o.cov)
+        variances[row, 2] += weights.heave_m[n] ** 2
+        if o.repeated is not None:
+            repeated[row] = o.repeated * problem.floors**2
+    lidars = {observations[n].lidar for n in seen}
+    drives = {observations[n].drive for n in seen}
+    fitted = len(lidars) + len(drives)
+    tilts, distances = (
+        _Scatter(residuals[:, k], variances[:, k], repeated[:, k], n * fitted)
+        for k, n in ((slice(2), 2), (slice(2, 3), 1))
+    )
+    return tilts, distances
+
+
+def _of_stands(
+    problem: Problem, weights: GroundWeights, values: gtsam.Values, height_m: float
+) -> _Scatter:
+    """Heights (n, 1) of the vehicle frame over its drive's plane, less the drive's error."""
+    seen = np.flatnonzero(weights.stands >= SEEN)
+    residuals = np.zeros((len(seen), 1))
+    drives = [problem.poses[i][0] for i in seen.tolist()]
+    for row, (i, drive) in enumerate(zip(seen.tolist(), drives, strict=True)):
+        place = values.atPose3(key_vehicle(i)).translation()
+        centre = ground_centre(problem, drive)
+        height = height_over(values.atVector(key_ground(drive)), centre, place)[0]
+        residuals[row] = height - height_m - values.atVector(key_height(drive))
+    waves = problem.floors[2] ** 2
+    variances = np.full_like(residuals, problem.heave_m**2 + waves)
+    shares = standing_shares(problem, weights.stands)[seen, None]
+    return _Scatter(residuals, variances, (shares - 1.0) * waves**2, len(set(drives)))

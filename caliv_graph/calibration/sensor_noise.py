@@ -21,6 +21,7 @@ from caliv_graph.calibration.evidence import (
     linearised_evidence,
     motion_evidence,
 )
+from caliv_graph.calibration.ground_scatter import GroundLevels
 from caliv_graph.calibration.noise import CLOUD, LOG_SPREAD
 from caliv_graph.calibration.open_errors import (
     RATHER_NONE,
@@ -113,16 +114,21 @@ class SensorNoise:
     opened: tuple[str, ...] = ()
     levels: tuple[NoiseLevel, ...] = ()
 
-    def with_ground_normal(self, sigma_rad: float) -> SensorNoise:
-        """The same with another 1 sigma of the tilt of ground planes."""
+    def with_ground_levels(self, found: GroundLevels) -> SensorNoise:
+        """The same with levels of ground and heave that residuals asked for."""
+        sigmas = {
+            "ground_normal": found.normal_rad,
+            "ground_distance": found.distance_m,
+            "heave": found.heave_m,
+        }
         levels = tuple(
-            replace(level, sigma=sigma_rad, source=RESIDUALS)
-            if level.name == "ground_normal"
+            replace(level, sigma=sigmas[level.name], source=RESIDUALS)
+            if level.name in sigmas and sigmas[level.name] != level.sigma
             else level
             for level in self.levels
         )
-        floors = np.array([sigma_rad, sigma_rad, self.floors[2]])
-        return replace(self, floors=floors, levels=levels)
+        floors = np.array([found.normal_rad, found.normal_rad, found.distance_m])
+        return replace(self, heave_m=found.heave_m, floors=floors, levels=levels)
 
 
 def estimated_noise(

@@ -1,15 +1,22 @@
-"""Waves of the ground by the scatter of its planes at a solution, against known sizes."""
+"""Waves and heave by the scatter of planes and stands at a solution, against known sizes."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
+import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.ground import full_weights
-from caliv_graph.calibration.ground_scatter import FEWEST_PLANES, larger_normal_rad
+from caliv_graph.calibration.ground import full_weights, ground_centre
+from caliv_graph.calibration.ground_factors import height_over, plane_normal
+from caliv_graph.calibration.ground_scatter import FEWEST_PLANES, GroundLevels, larger_levels
+from caliv_graph.calibration.problem import usual_heave_m
+from caliv_graph.calibration.sensor_noise import RESIDUALS, usual_noise
+from caliv_graph.config.noise import NoiseConfig
+from caliv_graph.conventions import key_height
 from caliv_graph.products import Array
 from tests.calibration.problems import make_case
 from tests.calibration.test_ground import SIGMAS, observed, with_planes
@@ -18,39 +25,49 @@ PLANE = np.array([0.01, -0.02, 0.7])
 NORMAL_RAD = float(SIGMAS[0])
 
 
-def asked(waves_rad: float, seed: int = 0, count: int = 20, odd: int = 0) -> float | None:
-    """Planes with the sigmas that they state, and waves; `odd` of them are 0.1 rad off."""
+def asked(waves: Array, seed: int = 0, count: int = 20, odd: int = 0) -> GroundLevels:
+    """Planes with the sigmas that they state, and waves (3,); `odd` are 0.1 rad and m off."""
     case = make_case(count=count)
     rng = np.random.default_rng(seed)
 
     def off(n: int) -> np.ndarray:
-        tilt = waves_rad * np.array([1.0, 1.0, 0.0]) * rng.normal(size=3)
-        return SIGMAS * rng.normal(size=3) + tilt + (0.1 if n < odd else 0.0)
+        own, common = SIGMAS * rng.normal(size=3), waves * rng.normal(size=3)
+        return np.asarray(own + common + (0.1 if n < odd else 0.0))
 
     planes = observed(case.problem, case.truth, PLANE, off)
     weights = full_weights(case.problem, planes)
     values = with_planes(case.truth, PLANE)
-    return larger_normal_rad(case.problem, planes, weights, values, NORMAL_RAD)
+    return larger_levels(case.problem, planes, weights, values, None)
+
+
+TILTS, DISTANCES = np.array([1.0, 1.0, 0.0]) * SIGMAS, np.array([0.0, 0.0, 1.0]) * SIGMAS
+STATED = GroundLevels(NORMAL_RAD, float(SIGMAS[2]), usual_heave_m())
+"""Those of the problem: `observed` has no other errors than these."""
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_planes_that_scatter_as_they_state_ask_for_nothing(seed: int) -> None:
-    assert asked(0.0, seed) is None
+    assert asked(0.0 * TILTS, seed) == STATED
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_waves_are_found_and_added(seed: int) -> None:
-    assert asked(4 * NORMAL_RAD, seed) == pytest.approx(NORMAL_RAD * np.hypot(1, 4), rel=0.25)
+    tilted = asked(4 * TILTS, seed)
+    assert tilted.normal_rad == pytest.approx(NORMAL_RAD * np.hypot(1, 4), rel=0.25)
+    assert replace(tilted, normal_rad=NORMAL_RAD) == STATED
+    lifted = asked(4 * DISTANCES, seed)
+    assert lifted.distance_m == pytest.approx(STATED.distance_m * np.hypot(1, 4), rel=0.35)
+    assert replace(lifted, distance_m=STATED.distance_m) == STATED
 
 
 def test_a_plane_that_is_far_off_is_no_waves() -> None:
-    assert asked(0.0, odd=1) is None
+    assert asked(0.0 * TILTS, odd=1) == STATED
 
 
 def test_few_planes_say_nothing() -> None:
     case = make_case(count=2)
     assert len(case.problem.lidars) * 2 < FEWEST_PLANES
-    assert asked(10 * NORMAL_RAD, count=2) is None
+    assert asked(10 * (TILTS + DISTANCES), count=2) == STATED
 
 
 def test_several_drives_with_a_plane_or_two_each_say_nothing() -> None:
@@ -62,7 +79,46 @@ def test_several_drives_with_a_plane_or_two_each_say_nothing() -> None:
     planes = observed(problem, case.truth, PLANE, lambda _: 10 * SIGMAS * rng.normal(size=3))
     values, weights = with_planes(case.truth, PLANE, range(5)), full_weights(problem, planes)
     assert len(planes) > FEWEST_PLANES
-    assert larger_normal_rad(problem, planes, weights, values, NORMAL_RAD) is None
+    assert larger_levels(problem, planes, weights, values, None).normal_rad == NORMAL_RAD
+
+
+HEIGHT_M = 0.4
+
+
+def standing(heave_m: float, seed: int, error_m: float = 0.0) -> float:
+    """The heave that is asked for where the vehicle heaves by this; `error_m` is the drive's."""
+    case, rng = make_case(count=80), np.random.default_rng(seed)
+    values = with_planes(case.truth, PLANE)
+    values.update(key_height(0), np.array([error_m]))
+    centre = ground_centre(case.problem, 0)
+    for key in case.problem.pose_keys():
+        T = values.atPose3(key)
+        above = height_over(PLANE, centre, T.translation())[0]
+        lift = HEIGHT_M + error_m + heave_m * rng.normal() - above
+        up = lift * plane_normal(PLANE)
+        values.update(key, gtsam.Pose3(T.rotation(), T.translation() + up))
+    planes = observed(case.problem, values, PLANE)
+    weights = full_weights(case.problem, planes)
+    return larger_levels(case.problem, planes, weights, values, HEIGHT_M).heave_m
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_heave_is_found_by_how_the_vehicle_stands(seed: int) -> None:
+    usual_m = math.hypot(STATED.heave_m, STATED.distance_m)  # waves below the vehicle
+    assert standing(usual_m, seed, error_m=0.05) == STATED.heave_m
+    found_m = math.hypot(standing(5 * usual_m, seed, error_m=0.05), STATED.distance_m)
+    assert found_m == pytest.approx(5 * usual_m, rel=0.2)
+
+
+def test_levels_that_are_larger_say_where_they_are_from() -> None:
+    noise = usual_noise(NoiseConfig())
+    found = GroundLevels(2 * NORMAL_RAD, STATED.distance_m, 0.03)
+    after = noise.with_ground_levels(found)
+    np.testing.assert_array_equal(after.floors, [2 * NORMAL_RAD, 2 * NORMAL_RAD, SIGMAS[2]])
+    assert after.heave_m == 0.03
+    source = {level.name: level.source for level in after.levels}
+    assert source["ground_normal"] == source["heave"] == RESIDUALS
+    assert source["ground_distance"] == "the usual figure"
 
 
 def by_place(waves: Array, n: int) -> Array:
@@ -71,7 +127,7 @@ def by_place(waves: Array, n: int) -> Array:
 
 def test_scans_of_one_place_are_no_more_than_one() -> None:
     """Three places seen ten times each, waves alone: they are seldom as the mean has it."""
-    floors = np.array([NORMAL_RAD, NORMAL_RAD, 0.002]) ** 2
+    floors = SIGMAS**2
     found = 0
     for seed in range(20):
         case = make_case(count=30)
@@ -80,5 +136,6 @@ def test_scans_of_one_place_are_no_more_than_one() -> None:
         planes = observed(case.problem, case.truth, PLANE, partial(by_place, waves))
         alike = [replace(o, repeated=9.0 * floors) for o in planes]
         weights, values = full_weights(case.problem, alike), with_planes(case.truth, PLANE)
-        found += larger_normal_rad(case.problem, alike, weights, values, NORMAL_RAD) is not None
+        levels = larger_levels(case.problem, alike, weights, values, None)
+        found += levels.normal_rad > NORMAL_RAD
     assert found <= 1

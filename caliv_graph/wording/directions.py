@@ -17,7 +17,7 @@ from caliv_graph.uncertainty.observability import (
     undetermined_twists,
 )
 from caliv_graph.uncertainty.predicted import PredictedCovariance
-from caliv_graph.wording.remedies import REMEDIES, Evidence, evidence_of
+from caliv_graph.wording.remedies import REMEDIES, TURNED_ALREADY, Evidence, evidence_of
 
 NOTABLE = 0.2
 """Fraction of a direction's largest coordinate from which an axis is named."""
@@ -141,10 +141,11 @@ def remedy(
     notable = set(_notable(twist))
     if notable == {"z"}:
         return known.height
+    done = TURNED_ALREADY if weak and evidence != "odometry" else ""
     if "yaw" in notable and notable <= {"yaw", "x", "y"}:
-        return known.turn_centre
+        return known.turn_centre + done
     if notable & {"x", "y"}:
-        return known.straight
+        return known.straight + done
     return known.tilt if notable <= {"roll", "pitch"} else known.stationary
 
 

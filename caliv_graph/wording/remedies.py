@@ -134,6 +134,12 @@ OF_ODOMETRY = replace(
 )
 """Without motion data no manoeuvre tells S2V."""
 
+TURNED_ALREADY = (
+    "; if it does so already, the vehicle's poses are the limit: record better ones (fixes, IMU), "
+    "or measure the lever arm better"
+)
+"""Added to a manoeuvre where a drive determines the direction, but weakly."""
+
 REMEDIES: dict[Evidence, Remedies] = {
     "target": OF_TARGET,
     "structure": OF_STRUCTURE,

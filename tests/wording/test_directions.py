@@ -24,7 +24,7 @@ from caliv_graph.wording.directions import (
     remedy,
     same_as_parameters,
 )
-from caliv_graph.wording.remedies import OF_BOTH, OF_STRUCTURE, OF_TARGET
+from caliv_graph.wording.remedies import OF_BOTH, OF_STRUCTURE, OF_TARGET, TURNED_ALREADY
 from caliv_graph.wording.vehicle import vehicle_text
 from tests.drives_with_chair import RADIUS_M
 from tests.samples import MOUNTINGS, pose, turn_about, twist_of_all
@@ -134,6 +134,16 @@ def test_every_direction_has_a_manoeuvre_that_fixes_it(twist: list[float], expec
     for scale in (1.0, -1e-3):
         parts = {name: scale * part for name, part in twist_of_all(twist, LIDARS).items()}
         assert remedy(parts, LIDARS) == expected
+
+
+@pytest.mark.parametrize("twist", [[0, 0, 0, 1, 0, 0], [0, 0, 1, -9.16, 0, 0]])
+def test_of_a_drive_that_turned_the_poses_are_what_is_weak(twist: list[float]) -> None:
+    """The advice of a figure-eight does not help whoever drove one."""
+    parts = twist_of_all(twist, LIDARS)
+    weak, lost = remedy(parts, LIDARS, weak=True), remedy(parts, LIDARS)
+    assert weak == f"{lost}{TURNED_ALREADY}"
+    of_odometry = remedy(parts, LIDARS, weak=True, evidence="odometry")
+    assert of_odometry == remedy(parts, LIDARS, evidence="odometry")
 
 
 @pytest.mark.parametrize(

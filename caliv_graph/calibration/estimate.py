@@ -172,8 +172,10 @@ def _estimate(
             noise = larger.noise
         except (RegistrationError, SolveError) as error:
             failed = (
-                f"the solve that begins at the result of the first one failed ({error.what}): the "
-                "result is that of the first, whose sigmas may be too small",
+                "the result asks for a second solve, about it and with its noise levels, which "
+                f"failed: {error.what.rstrip('.')}. The result is that of the first, which may be "
+                "off by more than its sigmas: better initial guesses (lidars.<name>.initial) and "
+                "more scans of the target lead to one that needs no second",
             )
     if solved.offsets_s is not None:
         rough = replace(rough, offsets_s=solved.offsets_s)
@@ -204,7 +206,7 @@ def _for_another_solve(
     """What a solve that begins at a solved graph is given; None: nothing asks for one.
 
     What the target alone told may have been far off: structure is linearised where all leads. And
-    ground planes that scatter more at the result than was estimated have larger sigmas.
+    ground planes and stands that scatter more at the result than was estimated have larger sigmas.
     """
     grounds, noise, config = whole.grounds, whole.noise, whole.config
     larger = None if at.ground_weights is None else _larger_levels(at, at.ground_weights)
@@ -221,20 +223,12 @@ def _for_another_solve(
 
 
 def _larger_levels(at: SolveState, weights: GroundWeights) -> GroundLevels | None:
-    """Levels of ground and heave that a solved graph asks for; None: those that it has.
-
-    What the config states is held.
-    """
-    problem, noise, ground = at.problem, at.config.noise, at.config.ground
-    asked = larger_levels(problem, at.grounds, weights, at.values, ground.vehicle_height)
+    """Levels of ground and heave that a solved graph asks for; None: those that it has."""
+    problem = at.problem
     normal_rad, _, distance_m = problem.floors.tolist()
     before = GroundLevels(normal_rad, distance_m, problem.heave_m)
-    larger = GroundLevels(
-        asked.normal_rad if noise.ground_normal_deg is None else normal_rad,
-        asked.distance_m if noise.ground_distance_m is None else distance_m,
-        asked.heave_m if noise.heave_m is None else problem.heave_m,
-    )
-    return None if larger == before else larger
+    asked = larger_levels(problem, at.grounds, weights, at.values, at.config)
+    return None if asked == before else asked
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from scipy.special import chdtrc
 
 from caliv_graph.calibration.evidence import SEEN
 from caliv_graph.calibration.ground import (
+    TOGETHER_NS,
     GroundWeights,
     ground_centre,
     plane_factor_of,
@@ -19,6 +20,7 @@ from caliv_graph.calibration.ground import (
 )
 from caliv_graph.calibration.ground_factors import height_over
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_ground, key_height, key_vehicle
 from caliv_graph.products import Array, GroundObservation
 
@@ -47,29 +49,38 @@ class GroundLevels:
     heave_m: float
 
 
+MOST = GroundLevels(normal_rad=0.05, distance_m=0.2, heave_m=0.2)
+"""Larger levels are no ground and no springs, but a mistake."""
+
+
 def larger_levels(
     problem: Problem,
     observations: Sequence[GroundObservation],
     weights: GroundWeights,
     values: gtsam.Values,
-    height_m: float | None,
+    config: Config,
 ) -> GroundLevels:
-    """The levels that a solution asks for: those of the problem, or larger ones.
+    """The levels that a solution asks for: those of the problem, or larger ones, at most `MOST`.
 
     Before it, few planes tell: of seven, known to 2 mrad with the tilt that all share, waves of 0.1
     mrad were as likely as of 0.4, and S2S roll was off by ten sigmas. Those beside the target
     alone had heave and distance of 0.4 mm, where the ground of the drive has waves of 14 mm. Here
     all LiDARs agree on one ground, all along the drive. What scatters more than its sigmas say does
-    so by waves and heave. `values` is the solution, `weights` are the robust ones of the
-    observations there, `height_m` is that of the vehicle frame (None: it stands on no plane).
+    so by waves; stands, which the waves lift as they do planes, by heave for the rest. `values` is
+    the solution, `weights` are the robust ones in use. What the config states is held.
     """
     normal_rad, _, distance_m = problem.floors.tolist()
+    noise, heave_m = config.noise, problem.heave_m
     tilts, distances = _of_planes(problem, observations, weights, values)
-    heave_m = problem.heave_m
-    if height_m is not None:
-        stands = _of_stands(problem, weights, values, height_m)
-        heave_m = stands.larger(heave_m)
-    return GroundLevels(tilts.larger(normal_rad), distances.larger(distance_m), heave_m)
+    if noise.ground_normal_deg is None:
+        normal_rad = tilts.larger(normal_rad, MOST.normal_rad)
+    if noise.ground_distance_m is None:
+        distance_m = distances.larger(distance_m, MOST.distance_m)
+    height_m = config.ground.vehicle_height
+    if noise.heave_m is None and height_m is not None:
+        stands = _of_stands(problem, weights, values, height_m, distance_m)
+        heave_m = stands.larger(heave_m, MOST.heave_m)
+    return GroundLevels(normal_rad, distance_m, heave_m)
 
 
 @dataclass(frozen=True)
@@ -88,7 +99,7 @@ class _Scatter:
     repeated: Array
     fitted: int
 
-    def larger(self, sigma: float) -> float:
+    def larger(self, sigma: float, most: float) -> float:
         """Of a level that is in the variances with this sigma, the one that they ask for."""
         free = self.residuals.size - self.fitted
         if len(self.residuals) < FEWEST_PLANES or free < FEWEST_PLANES:
@@ -103,7 +114,7 @@ class _Scatter:
         for _ in range(ROUNDS):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self._squares(middle) > free else (low, middle)
-        return float(np.sqrt(sigma**2 + high))
+        return max(sigma, min(float(np.sqrt(sigma**2 + high)), most))
 
     def _squares(self, more: float) -> float:
         """Sum of squares in variances that are larger by `more`; outliers are three sigmas off."""
@@ -143,18 +154,30 @@ def _of_planes(
 
 
 def _of_stands(
-    problem: Problem, weights: GroundWeights, values: gtsam.Values, height_m: float
+    problem: Problem,
+    weights: GroundWeights,
+    values: gtsam.Values,
+    height_m: float,
+    waves_m: float,
 ) -> _Scatter:
-    """Heights (n, 1) of the vehicle frame over its drive's plane, less the drive's error."""
+    """Heights (n, 1) of the vehicle frame over its drive's plane, less the drive's error.
+
+    `waves_m` is 1 sigma of the waves below it. Poses of one place share them, and those of one
+    moment the heave.
+    """
     seen = np.flatnonzero(weights.stands >= SEEN)
     residuals = np.zeros((len(seen), 1))
-    drives = [problem.poses[i][0] for i in seen.tolist()]
-    for row, (i, drive) in enumerate(zip(seen.tolist(), drives, strict=True)):
+    poses = [problem.poses[i] for i in seen.tolist()]
+    for row, (i, (drive, _)) in enumerate(zip(seen.tolist(), poses, strict=True)):
         place = values.atPose3(key_vehicle(i)).translation()
         centre = ground_centre(problem, drive)
         height = height_over(values.atVector(key_ground(drive)), centre, place)[0]
         residuals[row] = height - height_m - values.atVector(key_height(drive))
-    waves = problem.floors[2] ** 2
-    variances = np.full_like(residuals, problem.heave_m**2 + waves)
-    shares = standing_shares(problem, weights.stands)[seen, None]
-    return _Scatter(residuals, variances, (shares - 1.0) * waves**2, len(set(drives)))
+    variances = np.full_like(residuals, problem.heave_m**2 + waves_m**2)
+    drives, stamps = np.array(poses, dtype=np.int64).reshape(-1, 2).T
+    at_once = np.abs(stamps[:, None] - stamps) <= TOGETHER_NS
+    at_once &= drives[:, None] == drives
+    together = at_once.sum(axis=1, keepdims=True) - 1.0
+    shares = standing_shares(problem, weights.stands)[seen, None] - 1.0
+    repeated = shares * waves_m**4 + together * problem.heave_m**4
+    return _Scatter(residuals, variances, repeated, len(np.unique(drives)))

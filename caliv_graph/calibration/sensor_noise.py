@@ -21,7 +21,7 @@ from caliv_graph.calibration.evidence import (
     linearised_evidence,
     motion_evidence,
 )
-from caliv_graph.calibration.ground_scatter import GroundLevels
+from caliv_graph.calibration.ground_scatter import MOST, GroundLevels
 from caliv_graph.calibration.noise import CLOUD, LOG_SPREAD
 from caliv_graph.calibration.open_errors import (
     RATHER_NONE,
@@ -56,9 +56,9 @@ many of its sigmas; chance gains as much in one of twenty drives, at levels that
 
 LEVELS: Mapping[str, Unknown] = {
     "registration": Unknown(1.0, LOG_SPREAD, (0.1, 30.0)),
-    "heave": Unknown(HEAVE_SIGMA_M, LOG_SPREAD, (1e-4, 0.2)),
-    "ground_normal": Unknown(NORMAL_FLOOR_RAD, LOG_SPREAD, (1e-5, 0.05)),
-    "ground_distance": Unknown(DISTANCE_FLOOR_M, LOG_SPREAD, (1e-4, 0.2)),
+    "heave": Unknown(HEAVE_SIGMA_M, LOG_SPREAD, (1e-4, MOST.heave_m)),
+    "ground_normal": Unknown(NORMAL_FLOOR_RAD, LOG_SPREAD, (1e-5, MOST.normal_rad)),
+    "ground_distance": Unknown(DISTANCE_FLOOR_M, LOG_SPREAD, (1e-4, MOST.distance_m)),
 }
 """White errors, a sigma each: of the registration as a factor, else in metres and radians. The
 usual figures are weak priors, a factor of ten."""

@@ -69,13 +69,14 @@ StructureTerms = Callable[
         frozenset[str],
         float,
         bool,
+        frozenset[tuple[int, str]],
     ],
     tuple[StructureTerm, ...],
 ]
 """Patches, priors of the poses, stamps of the poses to keep and trajectory of each drive; rough
 extrinsics, those of them that a target has placed, config, names of the LiDARs with a free time
-offset, 1 sigma of the heave, whether the strips lie on each other at these extrinsics -> a term per
-drive."""
+offset, 1 sigma of the heave, whether the strips lie on each other at these extrinsics, drives and
+LiDARs whose ground planes stand where they show few pieces of ground -> a term per drive."""
 
 
 SlowErrors = Callable[
@@ -247,6 +248,7 @@ class StructureEvidence:
         config: Config,
         *,
         aligned: bool = False,
+        on_planes: frozenset[tuple[int, str]] = frozenset(),
     ) -> tuple[StructureTerm, ...]:
         """The term of each drive that has structure.
 
@@ -259,6 +261,7 @@ class StructureEvidence:
             noise: of given poses.
             config: guesses and noise.
             aligned: the strips lie on each other at `start` already.
+            on_planes: drives and LiDARs whose ground planes stand where pieces are few.
 
         Raises:
             SolveError: it could not be solved.
@@ -284,6 +287,7 @@ class StructureEvidence:
             config.free_offsets(),
             heave_m,
             aligned,
+            on_planes,
         )
 
     def terms_beside(
@@ -294,20 +298,26 @@ class StructureEvidence:
         heave_m: float,
         told: ToldErrors = NOTHING_TOLD,
     ) -> tuple[StructureTerm, ...]:
-        """`terms` on the poses of a problem, from where the rough solves put its LiDARs."""
+        """`terms` on the poses of a problem, from where a solve put its LiDARs."""
         kept: dict[int, list[int]] = {}
         for drive, stamp in problem.poses:
             kept.setdefault(drive, []).append(stamp)
         start = told.T_vehicle_lidar or rough_extrinsics(state)
+        # A solve that had structure has LiDARs that no target has placed, too.
+        placed = {state.problem.lidars[i] for i in state.problem.cloud_lidar.tolist()}
+        placed |= state.problem.fixed
+        extrinsics = state.problem.extrinsics(state.values)
         return self.terms(
             trajectories,
             kept,
             start,
-            state.problem.extrinsics(state.values),
+            {name: T for name, T in extrinsics.items() if name in placed},
             heave_m,
             state.noise,
             state.config,
             aligned=told.aligned,
+            # A plane alone does not make a LiDAR part of a calibration: a target has to.
+            on_planes=frozenset((o.drive, o.lidar) for o in state.grounds if o.lidar in placed),
         )
 
 

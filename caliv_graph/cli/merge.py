@@ -54,7 +54,6 @@ def merge(
         extra = {
             "out": str(out),
             "agreement": agreement_document(merger, p_value),
-            "warnings": list(merger.warnings),
         }
         document = calibration_document(merger.calibration)
         streams.show_json(without_infinities({**document, **extra}))

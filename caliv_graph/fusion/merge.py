@@ -31,7 +31,10 @@ _MERGED, _PRIOR = "merged", "prior"
 """Keys of the provenance: those of the parts of a result, and that of its `--prior`."""
 
 _OF_PRIOR = "--prior: "
-"""Begins the contradictions of an earlier calibration."""
+"""Begins the contradictions and warnings of an earlier calibration."""
+
+_CONFLICT = "--prior and this drive disagree: "
+"""Begins the warning of a mount that has moved. It is about the two that are calibrated then."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def merge(calibrations: Mapping[str, Calibration], p_value: float = ALPHA) -> Me
         ),
         *_differing_guesses(calibrations, calibration),
     ]
-    before = (said for c in calibrations.values() for said in c.warnings)
+    before = (said for c in calibrations.values() for said in _handed_on(c.warnings))
     calibration = replace(calibration, warnings=tuple(dict.fromkeys([*before, *warnings])))
     return Merger(calibration, agreement, tuple(warnings))
 
@@ -227,7 +230,7 @@ def with_earlier(
     warnings = []
     if comparison.moved:
         warnings.append(
-            f"--prior and this drive disagree: {_largest(comparison)}. {comparison.conclusion} The "
+            f"{_CONFLICT}{_largest(comparison)}. {comparison.conclusion} The "
             "result mixes both: calibrate without --prior"
         )
     if prior.status == "inconsistent":
@@ -240,7 +243,12 @@ def with_earlier(
 
 def _as_of_prior(said: Sequence[str]) -> tuple[str, ...]:
     """Sentences of an earlier calibration, marked as such."""
-    return tuple(f"{_OF_PRIOR}{sentence.removeprefix(_OF_PRIOR)}" for sentence in said)
+    return tuple(f"{_OF_PRIOR}{one.removeprefix(_OF_PRIOR)}" for one in _handed_on(said))
+
+
+def _handed_on(said: Sequence[str]) -> tuple[str, ...]:
+    """Sentences of a calibration that are true of what is made of it, too."""
+    return tuple(sentence for sentence in said if not sentence.startswith(_CONFLICT))
 
 
 def _assembled(

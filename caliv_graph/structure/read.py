@@ -137,13 +137,13 @@ def lidars_above_ground(
     patches: DrivePatches,
     trajectory: VehicleTrajectory,
     T_vehicle_lidar: Mapping[str, gtsam.Pose3],
-    placed: Collection[str] = (),
+    on_planes: Collection[str] = (),
 ) -> BoolArray:
     """(L,) LiDARs for whose ground the strips stand.
 
     They do not see it at a grazing angle only, and in several pieces. Of others the fitted plane of
-    a scan, which is made of all points, knows more. Pieces suffice of LiDARs that no target has
-    `placed`: a plane alone does not make them part of a calibration.
+    a scan, which is made of all points, knows more. `on_planes` are LiDARs for which such planes
+    stand where pieces are few; of others these are all that is known of the ground.
 
     Raises:
         TrajectoryError: a scan is outside the trajectory's span.
@@ -158,7 +158,7 @@ def lidars_above_ground(
     steep = np.bincount(lidar[of_ground & (cosine > STEEP_COS)], minlength=lidars)
     scans = np.bincount(patches.scan_lidar, minlength=lidars)
     few = seen < FEWEST_OF_GROUND * scans
-    few &= [name in placed for name in patches.lidars]
+    few &= [name in on_planes for name in patches.lidars]
     return np.asarray((steep >= LEAST_SHARE * seen) & ~few)
 
 

@@ -70,7 +70,7 @@ def slow_errors(
     aligned = aligned_start(patches, trajectories, start, config)
     out = []
     for own, prior, told, trajectory in zip(patches, priors, tell, trajectories, strict=True):
-        used = usable(own, trajectory, aligned, config, held)
+        used = usable(own, trajectory, aligned, config)
         found = None
         if len(used.scan):
             followed = used.followed(aligned)

@@ -62,6 +62,7 @@ def structure_terms(
     free_offsets: frozenset[str],
     heave_m: float,
     aligned: bool,
+    on_planes: Collection[tuple[int, str]] = (),
 ) -> tuple[StructureTerm, ...]:
     """The term of each drive that has structure.
 
@@ -77,6 +78,7 @@ def structure_terms(
         free_offsets: LiDARs whose time offset is estimated.
         heave_m: 1 sigma of the heave.
         aligned: the strips lie on each other at `start` already.
+        on_planes: drives and LiDARs whose fitted ground planes stand where pieces are few.
 
     Raises:
         SolveError: a system is singular.
@@ -92,7 +94,8 @@ def structure_terms(
     del priors
     for own, kept, trajectory in zip(patches, kept_ns, trajectories, strict=True):
         prior = left.pop(0)
-        used = usable(own, trajectory, start, config, held)
+        of_drive = {name for drive, name in on_planes if drive == own.drive}
+        used = usable(own, trajectory, start, config, of_drive)
         if not len(used.scan):
             continue
         used = used.followed(start)
@@ -145,16 +148,16 @@ def usable(
     trajectory: VehicleTrajectory,
     T_vehicle_lidar: Mapping[str, gtsam.Pose3],
     config: Config,
-    placed: Collection[str] = (),
+    on_planes: Collection[str] = (),
 ) -> DrivePatches:
     """The patches without those of the ground of LiDARs for whose ground the strips do not stand.
 
-    Of none they do where the config does without the ground. `placed` are LiDARs that a target has
-    placed.
+    Of none they do where the config does without the ground. `on_planes` are as for
+    `read.lidars_above_ground`.
     """
     standing = np.zeros(len(patches.lidars), dtype=bool)
     if config.ground.use:
-        standing = lidars_above_ground(patches, trajectory, T_vehicle_lidar, placed)
+        standing = lidars_above_ground(patches, trajectory, T_vehicle_lidar, on_planes)
     if standing.all():
         return patches
     is_level = level(patches, trajectory, T_vehicle_lidar)

@@ -145,7 +145,9 @@ def _drive(
 ) -> _Drive:
     """The problem of all strips, and which are held out: by place, with the calibration."""
     noise = usual_noise(config.noise)
-    patches = usable(patches, trajectory, extrinsics.T_vehicle_lidar, config)
+    # As for the calibration: its pieces of ground are believed too much.
+    on_planes = [name for name, result in calibration.lidars.items() if result.saw_target]
+    patches = usable(patches, trajectory, extrinsics.T_vehicle_lidar, config, on_planes)
     priors = pose_priors(
         [trajectory],
         {0: np.unique(patches.stamps_ns)},

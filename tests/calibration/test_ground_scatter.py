@@ -12,15 +12,21 @@ import pytest
 
 from caliv_graph.calibration.ground import full_weights, ground_centre
 from caliv_graph.calibration.ground_factors import height_over, plane_normal
-from caliv_graph.calibration.ground_scatter import FEWEST_PLANES, GroundLevels, larger_levels
+from caliv_graph.calibration.ground_scatter import FEWEST_PLANES, MOST, GroundLevels, larger_levels
 from caliv_graph.calibration.problem import usual_heave_m
 from caliv_graph.calibration.sensor_noise import RESIDUALS, usual_noise
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.model import Config, GroundConfig
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.conventions import key_height
 from caliv_graph.products import Array
 from tests.calibration.problems import make_case
 from tests.calibration.test_ground import SIGMAS, observed, with_planes
 
+LIDARS = {"front": LidarConfig(topic="front")}
+NO_HEIGHT = Config(lidars=LIDARS)
+HEIGHT_M = 0.4
+WITH_HEIGHT = Config(lidars=LIDARS, ground=GroundConfig(vehicle_height=HEIGHT_M, sigma=0.01))
 PLANE = np.array([0.01, -0.02, 0.7])
 NORMAL_RAD = float(SIGMAS[0])
 
@@ -37,7 +43,7 @@ def asked(waves: Array, seed: int = 0, count: int = 20, odd: int = 0) -> GroundL
     planes = observed(case.problem, case.truth, PLANE, off)
     weights = full_weights(case.problem, planes)
     values = with_planes(case.truth, PLANE)
-    return larger_levels(case.problem, planes, weights, values, None)
+    return larger_levels(case.problem, planes, weights, values, NO_HEIGHT)
 
 
 TILTS, DISTANCES = np.array([1.0, 1.0, 0.0]) * SIGMAS, np.array([0.0, 0.0, 1.0]) * SIGMAS
@@ -79,35 +85,78 @@ def test_several_drives_with_a_plane_or_two_each_say_nothing() -> None:
     planes = observed(problem, case.truth, PLANE, lambda _: 10 * SIGMAS * rng.normal(size=3))
     values, weights = with_planes(case.truth, PLANE, range(5)), full_weights(problem, planes)
     assert len(planes) > FEWEST_PLANES
-    assert larger_levels(problem, planes, weights, values, None).normal_rad == NORMAL_RAD
+    assert larger_levels(problem, planes, weights, values, NO_HEIGHT) == STATED
 
 
-HEIGHT_M = 0.4
+def standing(
+    heave_m: float,
+    seed: int,
+    error_m: float = 0.0,
+    waves_m: float = 0.0,
+    noise: NoiseConfig | None = None,
+    at_once: int = 1,
+) -> GroundLevels:
+    """What is asked for where the vehicle heaves and stands on waves, which planes see too.
 
-
-def standing(heave_m: float, seed: int, error_m: float = 0.0) -> float:
-    """The heave that is asked for where the vehicle heaves by this; `error_m` is the drive's."""
+    `error_m` is the drive's, so many poses are of one moment and have one heave.
+    """
     case, rng = make_case(count=80), np.random.default_rng(seed)
-    values = with_planes(case.truth, PLANE)
+    problem, values = case.problem, with_planes(case.truth, PLANE)
+    poses = tuple(
+        (d, problem.poses[i - i % at_once][1] + i) for i, (d, _) in enumerate(problem.poses)
+    )
+    problem = replace(problem, poses=poses)
     values.update(key_height(0), np.array([error_m]))
-    centre = ground_centre(case.problem, 0)
-    for key in case.problem.pose_keys():
+    centre = ground_centre(problem, 0)
+    waves, lifts = waves_m * rng.normal(size=80), heave_m * rng.normal(size=80)
+    for i, key in enumerate(problem.pose_keys()):
         T = values.atPose3(key)
         above = height_over(PLANE, centre, T.translation())[0]
-        lift = HEIGHT_M + error_m + heave_m * rng.normal() - above
+        lift = HEIGHT_M + error_m + waves[i] + lifts[i - i % at_once] - above
         up = lift * plane_normal(PLANE)
         values.update(key, gtsam.Pose3(T.rotation(), T.translation() + up))
-    planes = observed(case.problem, values, PLANE)
-    weights = full_weights(case.problem, planes)
-    return larger_levels(case.problem, planes, weights, values, HEIGHT_M).heave_m
+    planes = observed(problem, values, PLANE, lambda n: np.array([0.0, 0.0, waves[n % 80]]))
+    config = WITH_HEIGHT if noise is None else WITH_HEIGHT.model_copy(update={"noise": noise})
+    return larger_levels(problem, planes, full_weights(problem, planes), values, config)
+
+
+USUAL_M = math.hypot(STATED.heave_m, STATED.distance_m)
+"""1 sigma of a stand, of heave and the waves below it."""
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_heave_is_found_by_how_the_vehicle_stands(seed: int) -> None:
-    usual_m = math.hypot(STATED.heave_m, STATED.distance_m)  # waves below the vehicle
-    assert standing(usual_m, seed, error_m=0.05) == STATED.heave_m
-    found_m = math.hypot(standing(5 * usual_m, seed, error_m=0.05), STATED.distance_m)
-    assert found_m == pytest.approx(5 * usual_m, rel=0.2)
+    assert standing(USUAL_M, seed, error_m=0.05) == STATED
+    found = standing(5 * USUAL_M, seed, error_m=0.05)
+    assert math.hypot(found.heave_m, found.distance_m) == pytest.approx(5 * USUAL_M, rel=0.2)
+    assert replace(found, heave_m=STATED.heave_m) == STATED
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_waves_below_the_vehicle_are_no_heave(seed: int) -> None:
+    found = standing(0.0, seed, waves_m=5 * USUAL_M)
+    assert found.distance_m == pytest.approx(5 * USUAL_M, rel=0.2)
+    assert found.heave_m == STATED.heave_m
+
+
+def test_poses_of_one_moment_have_one_heave() -> None:
+    found = [standing(USUAL_M, seed, at_once=10).heave_m for seed in range(20)]
+    assert sum(heave > STATED.heave_m for heave in found) <= 1
+
+
+def test_what_a_config_states_is_held() -> None:
+    waves_m = 5 * USUAL_M
+    stated = NoiseConfig(ground_distance_m=0.002)
+    found = standing(0.0, 0, waves_m=waves_m, noise=stated)
+    assert found.distance_m == STATED.distance_m
+    assert found.heave_m == pytest.approx(waves_m, rel=0.2)
+    stated = NoiseConfig(heave_m=0.005)
+    found = standing(waves_m, 0, noise=stated)
+    assert found.heave_m == STATED.heave_m
+
+
+def test_a_level_beyond_any_ground_is_not_asked_for() -> None:
+    assert standing(1.0, 0).heave_m == MOST.heave_m
 
 
 def test_levels_that_are_larger_say_where_they_are_from() -> None:
@@ -136,6 +185,6 @@ def test_scans_of_one_place_are_no_more_than_one() -> None:
         planes = observed(case.problem, case.truth, PLANE, partial(by_place, waves))
         alike = [replace(o, repeated=9.0 * floors) for o in planes]
         weights, values = full_weights(case.problem, alike), with_planes(case.truth, PLANE)
-        levels = larger_levels(case.problem, alike, weights, values, None)
+        levels = larger_levels(case.problem, alike, weights, values, NO_HEIGHT)
         found += levels.normal_rad > NORMAL_RAD
     assert found <= 1

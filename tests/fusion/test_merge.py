@@ -510,6 +510,12 @@ def test_a_mount_that_moved_since_the_prior() -> None:
     (warning,) = warnings
     assert "--prior and this drive disagree" in warning
     assert "LiDAR 'rear' has moved" in warning
+    # What comes of the result later has its status, but is about other drives.
+    mixed = replace(result, warnings=(*warnings, "no IMU"))
+    assert merged(mixed, drive(D, source="c")).warnings[0] == "no IMU"
+    handed_on, _ = with_earlier(drive(D, source="c"), mixed)
+    assert handed_on.warnings == ("--prior: no IMU",)
+    assert handed_on.status == "inconsistent"
 
 
 def test_a_prior_that_is_inconsistent_makes_the_result_so(tmp_path: Path) -> None:

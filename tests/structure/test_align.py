@@ -256,7 +256,7 @@ def test_strips_stand_for_the_ground_only_of_lidars_that_see_it_at_no_grazing_an
     np.testing.assert_array_equal(lidars_above_ground(nothing, TRAJECTORY, TRUTH), [True, True])
 
 
-def test_strips_stand_for_the_ground_of_a_placed_lidar_only_if_it_sees_several_pieces() -> None:
+def test_where_planes_stand_strips_do_only_for_a_lidar_that_sees_several_pieces() -> None:
     """Of three in a scan the middles have a plane; of fewer only the tilts are known."""
     patches = in_yard()
     of, scans = patches.scan_lidar[patches.scan], int(np.sum(patches.scan_lidar == 1))
@@ -269,7 +269,7 @@ def test_strips_stand_for_the_ground_of_a_placed_lidar_only_if_it_sees_several_p
         few = patches.part(kept)
         found = lidars_above_ground(few, TRAJECTORY, TRUTH, (second,))
         np.testing.assert_array_equal(found, [True, standing])
-        # Without a target a plane alone would not place it.
+        # Without planes the pieces are all that is known.
         found = lidars_above_ground(few, TRAJECTORY, TRUTH, (first,))
         np.testing.assert_array_equal(found, [True, True])
 

@@ -36,7 +36,7 @@ from caliv_graph.wording.physics import (
     poses_finding,
     tilt_finding,
 )
-from caliv_graph.wording.suspects import clock_finding
+from caliv_graph.wording.suspects import apart_finding, clock_finding
 
 
 def check_clouds(recordings: Sequence[Recording], config: Config) -> None:
@@ -112,7 +112,8 @@ def clock_findings(
 
     Surfaces tell the clocks of LiDARs against that of the IMU or the poses. Where this was
     estimated as off, the fewer wrong clocks are the likelier: that one, unless one LiDAR alone
-    explains as much.
+    explains as much. Clocks that are all right by that are compared with each other: of this the
+    motion data's own errors are no part, and a millisecond shows.
     """
     suspects = calibration.suspects
     if suspects and suspects[0].sigmas > CONTRADICTION_SIGMAS:
@@ -132,7 +133,26 @@ def clock_findings(
             if finding is not None
         )
 
-    return min(against(0.0), against(sum(inertial)), key=len)
+    found = min(against(0.0), against(sum(inertial)), key=len)
+    return found or _apart(names, terms)
+
+
+def _apart(names: Sequence[str], terms: Sequence[StructureTerm]) -> tuple[Finding, ...]:
+    """Clocks of LiDARs against each other, the most significant pairs; each LiDAR once a drive."""
+    out: list[Finding] = []
+    for term in terms:
+        pairs = {
+            pair: finding
+            for pair, told in term.clocks_apart.items()
+            for finding in [apart_finding(names[term.drive], pair, *told)]
+            if finding is not None
+        }
+        named: set[str] = set()
+        for pair in sorted(pairs, key=lambda pair: -pairs[pair].sigmas):
+            if named.isdisjoint(pair):
+                out.append(pairs[pair])
+                named.update(pair)
+    return tuple(out)
 
 
 def heading_findings(

@@ -473,6 +473,7 @@ class StructureTerm:
             none, or no ground below the vehicle was seen.
         clocks: LiDAR -> how late its stamps are and 1 sigma, seconds, by these surfaces alone, of
             the LiDARs whose offset is held at zero.
+        clocks_apart: two of these -> how much later the stamps of the second are, and 1 sigma.
         channels: LiDAR -> 1 sigma of the errors of one of its channels, estimated: range (m),
             elevation and azimuth (rad).
     """
@@ -493,6 +494,7 @@ class StructureTerm:
     stance: Stance | None = None
     standing: StandingErrors | None = None
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    clocks_apart: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     channels: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
 

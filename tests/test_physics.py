@@ -119,3 +119,32 @@ def test_a_clock_that_walls_contradict_leads_where_the_ranking_has_no_culprit() 
     # Another culprit bends the walls.
     culprit = replace(calm, suspects=(suspect("gnss.drift", 8.0), clock))
     assert clock_findings(["drive"], [term(front=(0.02, 0.001))], culprit) == ()
+
+
+def apart(**told: float) -> StructureTerm:
+    """Clocks that are so many milliseconds later than that of 'front', to 0.2."""
+    pairs = {("front", name): (1e-3 * ms, 2e-4) for name, ms in told.items()}
+    return replace(term(**dict.fromkeys(("front", *told), (0.0, 1e-3))), clocks_apart=pairs)
+
+
+def test_clocks_of_lidars_are_compared_with_each_other() -> None:
+    calm = make_calibration()
+
+    (found,) = clock_findings(["drive"], [apart(rear=-1.5)], calm)
+
+    assert (found.input, found.severity) == ("lidars.rear.time_offset", "contradiction")
+    # With the allowance of 0.1 ms: 1.5 / sqrt(0.2^2 + 0.1^2).
+    assert found.sigmas == pytest.approx(6.71, abs=0.01)
+    assert "drive: lidars 'front' and 'rear': by the surfaces around" in found.sentence
+    assert "'rear' are 1.50 +- 0.22 ms earlier than those of 'front' (7 sigma)" in found.sentence
+    (doubt,) = clock_findings(["drive"], [apart(rear=1.0)], calm)
+    assert doubt.severity == "warning"
+    assert "ms later than" in doubt.sentence
+    assert clock_findings(["drive"], [apart(rear=0.8)], calm) == ()
+    # One clock that is off is off against all others: one sentence says so.
+    (worst,) = clock_findings(["drive"], [apart(rear=1.5, left=2.0)], calm)
+    assert worst.input == "lidars.left.time_offset"
+    # One that the motion data contradict, too, is named by itself.
+    both = replace(apart(rear=20.0), clocks={"front": (0.0, 1e-3), "rear": (0.02, 1e-3)})
+    (alone,) = clock_findings(["drive"], [both], calm)
+    assert "and 'rear'" not in alone.sentence

@@ -7,6 +7,11 @@ that there is none, no variable is added.
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from caliv_graph.products import Array, IntArray
@@ -23,6 +28,31 @@ SIGMAS = 200
 """Sigmas that are tried, evenly spread in the logarithm: 4 percent apart."""
 
 
+@dataclass(frozen=True)
+class Clocks:
+    """What surfaces tell of clocks of LiDARs that are held, seconds.
+
+    Attributes:
+        late: LiDAR -> how late its stamps are against the motion data, and 1 sigma.
+        apart: two LiDARs -> how much later the stamps of the second are, and 1 sigma. What the
+            motion data have wrong is common to both.
+    """
+
+    late: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    apart: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
+
+    @classmethod
+    def told(cls, names: Sequence[str], values: Array, cov: Array) -> Clocks:
+        """Of values (n,) and covariance (n, n)."""
+        sigmas = np.sqrt(np.diag(cov)).tolist()
+        late = {n: (v, s) for n, v, s in zip(names, values.tolist(), sigmas, strict=True)}
+        apart = {}
+        for (i, one), (j, other) in itertools.combinations(enumerate(names), 2):
+            variance = cov[i, i] + cov[j, j] - 2.0 * cov[i, j]
+            apart[one, other] = float(values[j] - values[i]), math.sqrt(max(variance, 0.0))
+        return cls(late, apart)
+
+
 def told_of_jitters(H: Array, b: Array, layout: Layout) -> tuple[Array, Array]:
     """Information A (S, S) and gradient u (S,) of the jitters, everything else eliminated.
 
@@ -35,7 +65,7 @@ def told_of_jitters(H: Array, b: Array, layout: Layout) -> tuple[Array, Array]:
 
 
 def told_clocks(A: Array, u: Array, scan_lidar: IntArray, lidars: int) -> tuple[Array, Array]:
-    """How late the stamps of each LiDAR are, (n,) s, and 1 sigma; by what jitters are told.
+    """How late the stamps of each LiDAR are, (n,) s, and covariance (n, n); by what jitters tell.
 
     A late clock is the same jitter in all scans of a LiDAR. What the extrinsic could make up for is
     eliminated: in a curve to the left and one to the right, at two speeds, it cannot. Under the
@@ -43,7 +73,7 @@ def told_clocks(A: Array, u: Array, scan_lidar: IntArray, lidars: int) -> tuple[
     """
     own = (scan_lidar[:, None] == np.arange(lidars)).astype(np.float64)
     cov = np.linalg.inv(own.T @ A @ own + np.eye(lidars) / OFFSET_SIGMA_S**2)
-    return np.asarray(cov @ (own.T @ u)), np.sqrt(np.diag(cov))
+    return np.asarray(cov @ (own.T @ u)), np.asarray(cov)
 
 
 def jitter_sigma_s(A: Array, u: Array) -> float:

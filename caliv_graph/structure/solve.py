@@ -16,7 +16,12 @@ from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import usual_sigmas
 from caliv_graph.structure.bends import USUAL_PER_M
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
-from caliv_graph.structure.jitter import jitter_sigma_s, told_clocks, told_of_jitters
+from caliv_graph.structure.jitter import (
+    Clocks,
+    jitter_sigma_s,
+    told_clocks,
+    told_of_jitters,
+)
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
@@ -68,7 +73,6 @@ SMALL_SIGMAS = 0.02
 
 Pair = tuple[float, float]
 
-Clocks = dict[str, tuple[float, float]]
 """LiDAR -> how late its stamps are, and 1 sigma, seconds."""
 
 
@@ -153,7 +157,7 @@ class Solved(Estimate):
     system: System
     offsets_m: Array
     plane_rows: Array
-    clocks: Clocks = field(default_factory=dict)
+    clocks: Clocks = field(default_factory=Clocks)
 
     @cached_property
     def factor(self) -> tuple[Array, Array]:
@@ -343,9 +347,9 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks]:
     A, u = told_of_jitters(system.H, system.b, layout)
     system.H[held, held], system.b[held] = without
     names = problem.patches.lidars
-    values, sigmas = told_clocks(A, u, problem.patches.scan_lidar, len(names))
-    told = zip(names, values.tolist(), sigmas.tolist(), strict=True)
-    clocks = {} if layout.offsets else {name: (late, sigma) for name, late, sigma in told}
+    clocks = Clocks()
+    if not layout.offsets:
+        clocks = Clocks.told(names, *told_clocks(A, u, problem.patches.scan_lidar, len(names)))
     sigma_s = jitter_sigma_s(A, u)
     if sigma_s == 0.0:
         return None, system, clocks

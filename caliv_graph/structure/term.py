@@ -261,7 +261,8 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         strips=strips,
         offset_m=float(np.median(found.nuisances.sighting)),
         ground=lidars_with_ground(found),
-        clocks=found.clocks,
+        clocks=found.clocks.late,
+        clocks_apart=found.clocks.apart,
         channels=channel_sizes(found),
     )
     stated = found.problem.standing
@@ -331,6 +332,7 @@ def term_of_odometry(
         stance=None,
         standing=None,
         clocks={},
+        clocks_apart={},
         stamps_ns=found.problem.prior.stamps_ns[kept],
         T_map_vehicle=unstack(state.R_map_vehicle[kept], state.t_map_vehicle[kept]),
         information=information,

@@ -35,6 +35,10 @@ DOUBT_SIGMAS = 4.0
 CLOCK_BIAS_S = 2e-3
 """Allowance, 1 sigma: at 2 m/s it moves a cloud by 4 mm, about `REGISTRATION_BIAS`."""
 
+CLOCKS_APART_S = 1e-4
+"""Allowance, 1 sigma, for the clocks of two LiDARs against each other: of good synchronisation,
+and of times that are told of blocks of points. At 3 m/s it moves S2S by 0.3 mm."""
+
 CRAB_RAD = math.radians(0.1)
 """Allowance, 1 sigma: the rear axle of a sound vehicle is not exactly square to its body. Side slip
 in curves changes sign with the curve; `heading_disagreement` fits it."""

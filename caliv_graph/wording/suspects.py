@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from caliv_graph.products import Finding, Suspect
 from caliv_graph.uncertainty.consistency import (
     CLOCK_BIAS_S,
+    CLOCKS_APART_S,
     CONTRADICTION_SIGMAS,
     DOUBT_SIGMAS,
 )
@@ -90,6 +91,32 @@ def clock_finding(drive: str, lidar: str, late_s: float, sigma_s: float) -> Find
         "contradiction" if sigmas > CONTRADICTION_SIGMAS else "warning",
         f"{drive}: {key}: by the surfaces around, {_lateness(late_s, sigma_s)} ({sigmas:.0f} "
         f"sigma). {told}",
+    )
+
+
+def apart_finding(
+    drive: str, lidars: tuple[str, str], apart_s: float, sigma_s: float
+) -> Finding | None:
+    """Clocks of two LiDARs that the walls and the ground of a drive contradict; None if not.
+
+    `apart_s` is how much later the stamps of the second are.
+    """
+    sigma_s = math.hypot(sigma_s, CLOCKS_APART_S)
+    sigmas = abs(apart_s) / sigma_s
+    if sigmas < DOUBT_SIGMAS:
+        return None
+    first, second = lidars
+    way = "later" if apart_s > 0.0 else "earlier"
+    return Finding(
+        f"lidars.{second}.time_offset",
+        (apart_s,),
+        sigma_s,
+        sigmas,
+        "contradiction" if sigmas > CONTRADICTION_SIGMAS else "warning",
+        f"{drive}: lidars '{first}' and '{second}': by the surfaces around, the stamps of "
+        f"'{second}' are {1e3 * abs(apart_s):.2f} +- {1e3 * sigma_s:.2f} ms {way} than those of "
+        f"'{first}' ({sigmas:.0f} sigma), and S2S is off by how far the vehicle moves meanwhile. "
+        "Synchronise their clocks, or set solve.time_offset",
     )
 
 

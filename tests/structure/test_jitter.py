@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from caliv_graph.products import Array
-from caliv_graph.structure.jitter import jitter_sigma_s, told_clocks, told_of_jitters
+from caliv_graph.structure.jitter import (
+    Clocks,
+    jitter_sigma_s,
+    told_clocks,
+    told_of_jitters,
+)
 from caliv_graph.structure.layout import Layout
 
 LAYOUT = Layout(poses=2, parameters=0, offsets=(), lidars=1, surface_of=(), jitters=150)
@@ -47,9 +53,23 @@ def test_a_late_clock_is_the_same_jitter_in_all_scans_of_a_lidar() -> None:
     whitened = []
     for seed in range(40):
         A, u = told(seed, lambda _: truth[scan_lidar])
-        late_s, sigma_s = told_clocks(A, u, scan_lidar, 3)
+        late_s, cov = told_clocks(A, u, scan_lidar, 3)
+        sigma_s = np.sqrt(np.diag(cov))
         assert (late_s[2], sigma_s[2]) == pytest.approx((0.0, 0.05))
         assert (sigma_s[:2] < 1e-3).all()
         whitened.append((late_s - truth)[:2] / sigma_s[:2])
     assert np.mean(np.square(whitened)) == pytest.approx(1.0, abs=0.35)
     assert np.abs(whitened).max() < 4.0
+
+
+def test_clocks_are_apart_by_less_than_each_is_unknown() -> None:
+    """An error that is common to both is in neither's difference."""
+    values, common = np.array([0.003, 0.0041, 0.0]), np.array([1.0, 1.0, 0.0])
+    cov = np.diag([1e-8, 3e-8, 2.5e-3]) + 1e-6 * np.outer(common, common)
+
+    clocks = Clocks.told(("a", "b", "unseen"), values, cov)
+
+    assert clocks.late["b"] == pytest.approx((0.0041, math.sqrt(1.03e-6)))
+    assert clocks.apart["a", "b"] == pytest.approx((0.0011, 2e-4))
+    assert set(clocks.apart) == {("a", "b"), ("a", "unseen"), ("b", "unseen")}
+    assert clocks.apart["a", "unseen"][1] == pytest.approx(math.sqrt(1e-6 + 1e-8 + 2.5e-3))

@@ -18,6 +18,7 @@ from caliv_graph.structure import term as terms
 from caliv_graph.structure import thickness
 from caliv_graph.structure.beams import beam_nodes
 from caliv_graph.structure.elimination import factor_of
+from caliv_graph.structure.jitter import Clocks
 from caliv_graph.structure.noise import ONE_VIEW_M, range_sigmas
 from caliv_graph.structure.problem import Problem, geometry_at, part_of
 from caliv_graph.structure.residuals import Geometry
@@ -124,17 +125,19 @@ def solved() -> Solved:
 def test_a_late_clock_shows_while_it_is_held(solved: Solved) -> None:
     """In curves to both sides no extrinsic makes up for it."""
     late = solve(problem_of(yard(), figure_eight(24), 1, clock_s=0.02))
-    assert set(late.clocks) == set(solved.clocks) == {"front", "rear"}
-    for name, (value_s, sigma_s) in late.clocks.items():
+    assert set(late.clocks.late) == set(solved.clocks.late) == {"front", "rear"}
+    for name, (value_s, sigma_s) in late.clocks.late.items():
         # One linear step from the wrong extrinsics, on poses 2 m apart.
         assert value_s == pytest.approx(0.02, rel=0.25)
         assert value_s > 20.0 * sigma_s
-        right_s, sigma_s = solved.clocks[name]
+        right_s, sigma_s = solved.clocks.late[name]
         assert abs(right_s) < 4.0 * sigma_s
+    apart_s, sigma_s = solved.clocks.apart["front", "rear"]
+    assert abs(apart_s) < 4.0 * sigma_s
     # Nothing is held where the offsets are free.
     free = replace(problem_of(yard(), figure_eight(10), 1, clock_s=0.02), offsets=(0, 1))
     accelerations = np.zeros_like(free.twists)
-    assert solve(replace(free, accelerations=accelerations)).clocks == {}
+    assert solve(replace(free, accelerations=accelerations)).clocks == Clocks()
 
 
 def test_a_yard_determines_all_but_the_height(solved: Solved) -> None:

@@ -94,7 +94,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def calibrated(*_: Any) -> Any:
     """What `pipeline.calibrate` gives."""
     return types.SimpleNamespace(
-        calibration=make_calibration(), solution=make_solution(), warnings=(), record=None
+        calibration=make_calibration(), solution=make_solution(), record=None
     )
 
 

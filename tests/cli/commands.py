@@ -25,11 +25,10 @@ import types
 def make_calibration(*lidars, **changes):
     from tests import samples
     return samples.make_calibration(*lidars, **changes)
-def run_of(calibration, warnings=()):
+def run_of(calibration):
     from tests.samples import make_solution
     return types.SimpleNamespace(
-        calibration=calibration, solution=make_solution(), observations=(), warnings=warnings,
-        record=None,
+        calibration=calibration, solution=make_solution(), observations=(), record=None,
     )
 """
 

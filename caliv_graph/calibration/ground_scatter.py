@@ -90,7 +90,7 @@ class _Scatter:
     Attributes:
         residuals: (n, k).
         variances: (n, k) of these.
-        repeated: (n, k) of them what other scans of a place have in common, times their number.
+        repeated: (n, k) squared, what a residual has in common with others, times their number.
         fitted: number of coordinates that the solution is fitted to.
     """
 
@@ -100,13 +100,12 @@ class _Scatter:
     fitted: int
 
     def larger(self, sigma: float, most: float) -> float:
-        """Of a level that is in the variances with this sigma, the one that they ask for."""
+        """The level that the residuals ask for, up to `most`; `sigma` is in their variances."""
         free = self.residuals.size - self.fitted
         if len(self.residuals) < FEWEST_PLANES or free < FEWEST_PLANES:
             return sigma
         ratio = self._squares(0.0) / free
-        # Waves that scans share are as many as there are places; noise of the points is of each
-        # scan.
+        # Waves that scans share are as many as there are places; noise of points is of each scan.
         apart = free / float(np.mean(1.0 + self.repeated / self.variances**2))
         if ratio < LARGEST_RATIO or chdtrc(apart, ratio * apart) > CHANCE:
             return sigma

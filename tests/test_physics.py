@@ -132,14 +132,14 @@ def test_clocks_of_lidars_are_compared_with_each_other() -> None:
 
     (found,) = clock_findings(["drive"], [apart(rear=-1.5)], calm)
 
-    assert (found.input, found.severity) == ("lidars.rear.time_offset", "contradiction")
+    # Jitter of the stamps may take it up: S2S may be right.
+    assert (found.input, found.severity) == ("lidars.rear.time_offset", "warning")
     # With the allowance of 0.1 ms: 1.5 / sqrt(0.2^2 + 0.1^2).
     assert found.sigmas == pytest.approx(6.71, abs=0.01)
     assert "drive: lidars 'front' and 'rear': by the surfaces around" in found.sentence
     assert "'rear' are 1.50 +- 0.22 ms earlier than those of 'front' (7 sigma)" in found.sentence
-    (doubt,) = clock_findings(["drive"], [apart(rear=1.0)], calm)
-    assert doubt.severity == "warning"
-    assert "ms later than" in doubt.sentence
+    (later,) = clock_findings(["drive"], [apart(rear=1.0)], calm)
+    assert "ms later than" in later.sentence
     assert clock_findings(["drive"], [apart(rear=0.8)], calm) == ()
     # One clock that is off is off against all others: one sentence says so.
     (worst,) = clock_findings(["drive"], [apart(rear=1.5, left=2.0)], calm)

@@ -35,7 +35,7 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.errors import CalivError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import Calibration, GivenPoses, MotionData
+from caliv_graph.products import GivenPoses, MotionData
 from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.scenario.model import Scenario, load_scenario
 from caliv_graph.simulation.recording import SimulatedRecording, simulate_drive
@@ -160,7 +160,7 @@ def run(task: tuple[str, str, int, bool]) -> Outcome:
         for key, of in found.vehicle.items()
         if key.endswith("_time_offset")
     ]
-    told = any("ms later than" in s or "ms earlier than" in s for s in said_of(found))
+    told = any("ms later than" in s or "ms earlier than" in s for s in found.warnings)
     return Outcome(
         f"exit {exit_code(found)}{', LiDARs apart' if told else ''}",
         tuple(float(of["s2v"]["translation_m"][0]) for of in errors.values()),
@@ -168,11 +168,6 @@ def run(task: tuple[str, str, int, bool]) -> Outcome:
         tuple(float(of["s2v"]["nees"]) for of in errors.values()),
         ", ".join(clocks),
     )
-
-
-def said_of(calibration: Calibration) -> tuple[str, ...]:
-    """What a person is told of a calibration."""
-    return (*calibration.contradictions, *calibration.warnings)
 
 
 def with_late_lidars(scenario: Scenario, late: Sequence[str], late_s: float) -> Scenario:

@@ -16,7 +16,6 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
 from caliv_graph.calibration.given_noise import noise_by_structure
-from caliv_graph.calibration.ground import GroundWeights
 from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.ground_scatter import GroundLevels, larger_levels
@@ -209,9 +208,11 @@ def _for_another_solve(
     ground planes and stands that scatter more at the result than was estimated have larger sigmas.
     """
     grounds, noise, config = whole.grounds, whole.noise, whole.config
-    larger = None if at.ground_weights is None else _larger_levels(at, at.ground_weights)
-    if larger is not None:
-        noise = noise.with_ground_levels(larger)
+    asked = before = GroundLevels.of(at.problem)
+    if at.ground_weights is not None:
+        asked = larger_levels(at.problem, at.grounds, at.ground_weights, at.values, config)
+    if asked != before:
+        noise = noise.with_ground_levels(asked)
         floors = whole.noise.floors, noise.floors
         grounds = with_floors(grounds, whole.trajectories, rough_extrinsics(at), *floors)
     elif not far_from(at.structure, at.problem.extrinsics(at.values)):
@@ -220,15 +221,6 @@ def _for_another_solve(
     others = lidars_with_structure(at.structure)
     problem = pose_problem(observations, whole.trajectories, config, noise, others, whole.kept)
     return replace(whole, problem=problem, grounds=grounds, noise=noise)
-
-
-def _larger_levels(at: SolveState, weights: GroundWeights) -> GroundLevels | None:
-    """Levels of ground and heave that a solved graph asks for; None: those that it has."""
-    problem = at.problem
-    normal_rad, _, distance_m = problem.floors.tolist()
-    before = GroundLevels(normal_rad, distance_m, problem.heave_m)
-    asked = larger_levels(problem, at.grounds, weights, at.values, at.config)
-    return None if asked == before else asked
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,10 @@ from caliv_graph.calibration.ground import (
     PLANE_SIGMAS,
     bias_sigmas,
     biased_lidars,
-    ground_centre,
+    ground_centres,
     place_weights,
     plane_factor_of,
+    seen_drives,
     taken_poses,
 )
 from caliv_graph.calibration.linear import linearise_clouds
@@ -317,14 +318,14 @@ def _ground_rows(state: SolveState, values: gtsam.Values, poses: IntArray) -> li
     for index in biased_lidars(problem, state.grounds, taken):
         values.update(key_ground_bias(index), np.zeros(GROUND_BIASES))
     normal, distance = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 1.0])
+    centres = ground_centres(problem, seen_drives(state.grounds, taken))
     out = []
     for n, o in enumerate(state.grounds):
         if taken[n] not in poses or weight[n] < SEEN:
             continue
-        centre = ground_centre(problem, o.drive)
         # With a unit covariance, GTSAM's whitening leaves the residual as it is.
         plain = replace(o, cov=np.eye(3))
-        factor = plane_factor_of(problem, plain, int(taken[n]), centre, rates=False)
+        factor = plane_factor_of(problem, plain, int(taken[n]), centres[o.drive], rates=False)
         linear: Any = factor.linearize(values)
         chain = 1 + len(problem.extrinsic_keys_of(o.lidar))
         ends = np.cumsum([6] * chain + [3])  # and the biases, if there are any

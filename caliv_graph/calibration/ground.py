@@ -8,7 +8,7 @@ centre)`, the centre in the middle of the drive, so that height and slopes hardl
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -73,6 +73,11 @@ def ground_centre(problem: Problem, drive: int) -> Array:
         if d == drive
     ]
     return np.asarray(np.mean(places, axis=0), dtype=np.float64)
+
+
+def ground_centres(problem: Problem, drives: Iterable[int]) -> dict[int, Array]:
+    """`ground_centre` of each of some drives, which may be there several times."""
+    return {drive: ground_centre(problem, drive) for drive in dict.fromkeys(drives)}
 
 
 def taken_poses(problem: Problem, observations: Sequence[GroundObservation]) -> IntArray:
@@ -157,7 +162,7 @@ def ground_graph(
     taken = taken_poses(problem, observations)
     weights = weights or full_weights(problem, observations)
     drives = seen_drives(observations, taken)
-    centres = {drive: ground_centre(problem, drive) for drive in drives}
+    centres = ground_centres(problem, drives)
     for drive in drives:
         graph.append("ground_prior", _plane_prior(problem, drive))
         if config.vehicle_height is not None:

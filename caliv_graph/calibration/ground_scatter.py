@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -13,7 +13,7 @@ from caliv_graph.calibration.evidence import SEEN
 from caliv_graph.calibration.ground import (
     TOGETHER_NS,
     GroundWeights,
-    ground_centre,
+    ground_centres,
     plane_factor_of,
     standing_shares,
     taken_poses,
@@ -48,6 +48,12 @@ class GroundLevels:
     distance_m: float
     heave_m: float
 
+    @classmethod
+    def of(cls, problem: Problem) -> GroundLevels:
+        """Those that a problem has."""
+        normal_rad, _, distance_m = problem.floors.tolist()
+        return cls(normal_rad, distance_m, problem.heave_m)
+
 
 MOST = GroundLevels(normal_rad=0.05, distance_m=0.2, heave_m=0.2)
 """Larger levels are no ground and no springs, but a mistake."""
@@ -69,18 +75,17 @@ def larger_levels(
     so by waves; stands, which the waves lift as they do planes, by heave for the rest. `values` is
     the solution, `weights` are the robust ones in use. What the config states is held.
     """
-    normal_rad, _, distance_m = problem.floors.tolist()
-    noise, heave_m = config.noise, problem.heave_m
+    out, noise = GroundLevels.of(problem), config.noise
     tilts, distances = _of_planes(problem, observations, weights, values)
     if noise.ground_normal_deg is None:
-        normal_rad = tilts.larger(normal_rad, MOST.normal_rad)
+        out = replace(out, normal_rad=tilts.larger(out.normal_rad, MOST.normal_rad))
     if noise.ground_distance_m is None:
-        distance_m = distances.larger(distance_m, MOST.distance_m)
+        out = replace(out, distance_m=distances.larger(out.distance_m, MOST.distance_m))
     height_m = config.ground.vehicle_height
     if noise.heave_m is None and height_m is not None:
-        stands = _of_stands(problem, weights, values, height_m, distance_m)
-        heave_m = stands.larger(heave_m, MOST.heave_m)
-    return GroundLevels(normal_rad, distance_m, heave_m)
+        stands = _of_stands(problem, weights, values, height_m, out.distance_m)
+        out = replace(out, heave_m=stands.larger(out.heave_m, MOST.heave_m))
+    return out
 
 
 @dataclass(frozen=True)
@@ -132,19 +137,18 @@ def _of_planes(
     """
     taken = taken_poses(problem, observations)
     seen = [n for n in range(len(observations)) if taken[n] >= 0 and weights.planes[n] >= SEEN]
+    lidars = {observations[n].lidar for n in seen}
+    centres = ground_centres(problem, (observations[n].drive for n in seen))
     residuals, variances, repeated = np.zeros((3, len(seen), 3))
     for row, n in enumerate(seen):
         o = observations[n]
-        centre = ground_centre(problem, o.drive)
-        factor = plane_factor_of(problem, o, int(taken[n]), centre)
+        factor = plane_factor_of(problem, o, int(taken[n]), centres[o.drive])
         residuals[row] = factor.unwhitenedError(values)
         variances[row] = np.diag(o.cov)
         variances[row, 2] += weights.heave_m[n] ** 2
         if o.repeated is not None:
             repeated[row] = o.repeated * problem.floors**2
-    lidars = {observations[n].lidar for n in seen}
-    drives = {observations[n].drive for n in seen}
-    fitted = len(lidars) + len(drives)
+    fitted = len(lidars) + len(centres)
     tilts, distances = (
         _Scatter(residuals[:, k], variances[:, k], repeated[:, k], n * fitted)
         for k, n in ((slice(2), 2), (slice(2, 3), 1))
@@ -167,10 +171,10 @@ def _of_stands(
     seen = np.flatnonzero(weights.stands >= SEEN)
     residuals = np.zeros((len(seen), 1))
     poses = [problem.poses[i] for i in seen.tolist()]
+    centres = ground_centres(problem, (drive for drive, _ in poses))
     for row, (i, (drive, _)) in enumerate(zip(seen.tolist(), poses, strict=True)):
         place = values.atPose3(key_vehicle(i)).translation()
-        centre = ground_centre(problem, drive)
-        height = height_over(values.atVector(key_ground(drive)), centre, place)[0]
+        height = height_over(values.atVector(key_ground(drive)), centres[drive], place)[0]
         residuals[row] = height - height_m - values.atVector(key_height(drive))
     variances = np.full_like(residuals, problem.heave_m**2 + waves_m**2)
     drives, stamps = np.array(poses, dtype=np.int64).reshape(-1, 2).T
@@ -179,4 +183,4 @@ def _of_stands(
     together = at_once.sum(axis=1, keepdims=True) - 1.0
     shares = standing_shares(problem, weights.stands)[seen, None] - 1.0
     repeated = shares * waves_m**4 + together * problem.heave_m**4
-    return _Scatter(residuals, variances, repeated, len(np.unique(drives)))
+    return _Scatter(residuals, variances, repeated, len(centres))

@@ -13,6 +13,7 @@ from caliv_graph.calibration.ground import (
     GroundWeights,
     first_heave,
     ground_centre,
+    ground_centres,
     seen_drives,
     taken_poses,
 )
@@ -54,7 +55,7 @@ def _residuals(
 ) -> Array:
     """(n, 3) residuals of role a with the vehicle at `poses`; NaN where not taken."""
     out = np.full((len(observations), 3), np.nan)
-    centres = {drive: ground_centre(problem, drive) for drive in seen_drives(observations, taken)}
+    centres = ground_centres(problem, seen_drives(observations, taken))
     extrinsics = problem.extrinsics(values)
     for row, (o, i) in enumerate(zip(observations, taken.tolist(), strict=True)):
         if i >= 0:

@@ -51,10 +51,7 @@ def merge(
     merger = merge_calibrations({str(p): read_calibration(p) for p in calibrations}, p_value)
     write_calibration(merger.calibration, out, force)
     if as_json:
-        extra = {
-            "out": str(out),
-            "agreement": agreement_document(merger, p_value),
-        }
+        extra = {"out": str(out), "agreement": agreement_document(merger, p_value)}
         document = calibration_document(merger.calibration)
         streams.show_json(without_infinities({**document, **extra}))
     else:

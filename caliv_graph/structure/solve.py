@@ -16,12 +16,7 @@ from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import usual_sigmas
 from caliv_graph.structure.bends import USUAL_PER_M
 from caliv_graph.structure.elimination import covariance_of, factor_of, solved
-from caliv_graph.structure.jitter import (
-    Clocks,
-    jitter_sigma_s,
-    told_clocks,
-    told_of_jitters,
-)
+from caliv_graph.structure.jitter import Clocks, jitter_sigma_s, told_clocks, told_of_jitters
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
 from caliv_graph.structure.noise import (
     FIRST_SIGHTING_M,
@@ -72,8 +67,6 @@ SMALL_SIGMAS = 0.02
 
 
 Pair = tuple[float, float]
-
-"""LiDAR -> how late its stamps are, and 1 sigma, seconds."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
-from caliv_graph.products import Array
+from caliv_graph.products import Array, BoolArray, IntArray
 from tests.samples import MOUNTINGS, pose
 
 PERIOD_NS = 200_000_000
@@ -57,6 +57,16 @@ def correlated_information(rng: np.random.Generator) -> Array:
     root = rng.normal(size=(6, 12)) / math.sqrt(12.0)
     cov = REGISTRATION_SIGMAS[:, None] * (root @ root.T + 0.1 * np.eye(6)) * REGISTRATION_SIGMAS
     return np.asarray(np.linalg.inv(cov), dtype=np.float64)
+
+
+def with_clouds(problem: Problem, which: BoolArray | IntArray | list[int]) -> Problem:
+    """The problem with some of its clouds, a mask or indices in any order, and the same poses."""
+    return replace(
+        problem,
+        cloud_lidar=problem.cloud_lidar[which],
+        cloud_pose=problem.cloud_pose[which],
+        cloud_placement=problem.cloud_placement[which],
+    )
 
 
 def make_case(

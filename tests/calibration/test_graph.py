@@ -43,6 +43,7 @@ from tests.calibration.problems import (
     moved,
     noisy,
     predictions,
+    with_clouds,
     with_poses,
 )
 
@@ -384,12 +385,7 @@ def test_lidars_that_share_nothing_know_nothing_of_each_other() -> None:
     # known, each by itself. With the target frames tied to nothing else, no covariance between.
     case = make_case(count=10, drives=2)
     keep = [j for j in range(40) if case.problem.cloud_lidar[j] == case.problem.cloud_placement[j]]
-    problem = replace(
-        case.problem,
-        cloud_lidar=case.problem.cloud_lidar[keep],
-        cloud_pose=case.problem.cloud_pose[keep],
-        cloud_placement=case.problem.cloud_placement[keep],
-    )
+    problem = with_clouds(case.problem, keep)
     graph = merged(
         pose_graph(problem, NOISE),
         cloud_graph(problem, [case.measured[j] for j in keep], case.information[keep]),

@@ -25,7 +25,7 @@ from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
 from caliv_graph.registration.register import JointRegistration
-from tests.calibration.problems import PERIOD_NS, SIGMAS, make_case
+from tests.calibration.problems import PERIOD_NS, SIGMAS, make_case, with_clouds
 from tests.registration.scenes import chair_scene, config_of, matrices
 from tests.samples import pose
 
@@ -52,12 +52,7 @@ def test_neighbouring_clouds_of_a_lidar_are_left_out_together() -> None:
 def test_clouds_of_a_lidar_with_few_are_left_out_one_by_one() -> None:
     problem = make_case("front", "rear", count=24).problem
     kept = (problem.cloud_lidar == 0) | (problem.cloud_pose % 2 == 0)
-    some = replace(
-        problem,
-        cloud_lidar=problem.cloud_lidar[kept],
-        cloud_pose=problem.cloud_pose[kept],
-        cloud_placement=problem.cloud_placement[kept],
-    )
+    some = with_clouds(problem, kept)
     group = _groups(some)
     for lidar, in_a_row in ((0, TOGETHER), (1, 1)):
         own = np.flatnonzero(some.cloud_lidar == lidar)
@@ -68,12 +63,7 @@ def test_clouds_of_a_lidar_with_few_are_left_out_one_by_one() -> None:
 def test_clouds_are_grouped_in_the_order_of_time() -> None:
     problem = make_case("front", count=24).problem
     order = np.random.default_rng(3).permutation(24)
-    mixed = replace(
-        problem,
-        cloud_lidar=problem.cloud_lidar[order],
-        cloud_pose=problem.cloud_pose[order],
-        cloud_placement=problem.cloud_placement[order],
-    )
+    mixed = with_clouds(problem, order)
     np.testing.assert_array_equal(_groups(mixed), _groups(problem)[order])
 
 

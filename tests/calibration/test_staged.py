@@ -20,7 +20,7 @@ from caliv_graph.config.model import Config, RobustConfig, SolveConfig
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, Registration, Solution
-from tests.calibration.problems import SIGMAS, Case, make_case, noisy
+from tests.calibration.problems import SIGMAS, Case, make_case, noisy, with_clouds
 from tests.samples import MOUNTINGS, make_solution
 
 LIDARS = ("front", "rear")
@@ -232,12 +232,7 @@ def test_clouds_of_several_targets_are_judged_together() -> None:
         one = registered(part, tuple(measured[j] for j in mine))
         registrations.append(replace(one, view_weights=np.ones(len(mine))))
     order = np.argsort(case.problem.cloud_placement, kind="stable")
-    problem = replace(
-        case.problem,
-        cloud_lidar=case.problem.cloud_lidar[order],
-        cloud_pose=case.problem.cloud_pose[order],
-        cloud_placement=case.problem.cloud_placement[order],
-    )
+    problem = with_clouds(case.problem, order)
     state = solve_registered(problem, registrations, (), config_of("huber"))
     snoop_clouds(state, registrations)
     assert order[state.weights.values < 1e-3].tolist() == [14, 20]

@@ -17,7 +17,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.products import GroundObservation, PoseNoise, StructureTerm
 from caliv_graph.structure.patches import DrivePatches
-from tests.calibration.problems import make_case
+from tests.calibration.problems import make_case, with_clouds
 from tests.calibration.test_structure import given, term_of
 
 ANYWHERE = PoseConfig(xyz=(0.0, 0.0, 0.0))
@@ -64,12 +64,7 @@ def test_what_no_target_has_placed_is_not_held_and_keeps_its_pieces_of_ground() 
     """A solve that had structure has LiDARs that saw no target: a second one begins at it."""
     case = make_case("front", "rear", "left")
     seen = case.problem.cloud_lidar < 2
-    problem = replace(
-        case.problem,
-        cloud_lidar=case.problem.cloud_lidar[seen],
-        cloud_pose=case.problem.cloud_pose[seen],
-        cloud_placement=case.problem.cloud_placement[seen],
-    )
+    problem = with_clouds(case.problem, seen)
     config = Config(
         lidars={name: LidarConfig(topic=name, initial=ANYWHERE) for name in problem.lidars}
     )

@@ -77,6 +77,10 @@ from caliv_graph.targets.ground.planes import ground_floors
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import VehicleTrajectory
 
+FURTHER_SOLVES = 2
+"""Solves at most that begin at the result of the one before: levels of the ground that are off by
+ten times are right after one, mostly."""
+
 
 def estimate(
     observations: Sequence[TargetObservation],
@@ -163,26 +167,34 @@ def _estimate(
     times = {"registration": rough.registration_s, "graph": rough.graph_s}
     whole = _Whole(problem, trajectories, grounds, structure, noise, kept, config)
     solved = _solved(whole, observations, rough.state, told, times, progress)
-    failed: tuple[str, ...] = ()
-    larger = _for_another_solve(whole, observations, solved.state)
-    if larger is not None:
+    left: tuple[str, ...] = ()
+    for _ in range(FURTHER_SOLVES):
+        larger = _for_another_solve(whole, observations, solved.state)
+        if larger is None:
+            break
         try:
             solved = _solved(larger, observations, solved.state, NOTHING_TOLD, times, progress)
-            noise = larger.noise
         except (RegistrationError, SolveError) as error:
-            failed = (
-                "the result asks for a second solve, about it and with its noise levels, which "
-                f"failed: {error.what.rstrip('.')}. The result is that of the first, which may be "
-                "off by more than its sigmas: better initial guesses (lidars.<name>.initial) and "
-                "more scans of the target lead to one that needs no second",
+            left = (
+                "the result asks for another solve, about it and with its noise levels, which "
+                f"failed: {error.what.rstrip('.')}. The result is that of the solve before, which "
+                "may be off by more than its sigmas: better initial guesses "
+                "(lidars.<name>.initial) and more scans of the target lead to one that needs no "
+                "other",
             )
+            break
+        whole = larger
+    else:
+        left = _unsettled(whole, _for_another_solve(whole, observations, solved.state))
+    left = (*left, *GroundLevels.of(whole.problem).beyond_ground)
     if solved.offsets_s is not None:
         rough = replace(rough, offsets_s=solved.offsets_s)
     said = (line for term in solved.state.structure for line in term.warnings)
     solution = solved.solution
     unconverged = _unconverged(solution.registrations)
-    warnings = (*rough.warnings, *solved.alike, *said, *unconverged, *failed)
-    solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=noise.levels)
+    warnings = (*rough.warnings, *solved.alike, *said, *unconverged, *left)
+    levels = whole.noise.levels
+    solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=levels)
     return solution, tuple(trajectories)
 
 
@@ -221,6 +233,25 @@ def _for_another_solve(
     others = lidars_with_structure(at.structure)
     problem = pose_problem(observations, whole.trajectories, config, noise, others, whole.kept)
     return replace(whole, problem=problem, grounds=grounds, noise=noise)
+
+
+def _unsettled(before: _Whole, after: _Whole | None) -> tuple[str, ...]:
+    """A warning: a result asks for one more solve, `after`; none if that is None."""
+    if after is None:
+        return ()
+    was, asked = GroundLevels.of(before.problem), GroundLevels.of(after.problem)
+    why = "a LiDAR is still far from where the walls were linearised"
+    if asked != was:
+        why = (
+            "planes of the ground and heights of the vehicle above it scatter more than their "
+            f"noise levels ({was.text}), as by {asked.text}"
+        )
+    return (
+        f"the result has not settled: solved again {FURTHER_SOLVES} times about itself, {why}. It "
+        "may be off by more than its sigmas: look for ground that is none (a ramp, a kerb, a load "
+        "in view), and for a LiDAR or a vehicle height (ground.vehicle_height) that is far from "
+        "its guess",
+    )
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -53,6 +54,26 @@ class GroundLevels:
         """Those that a problem has."""
         normal_rad, _, distance_m = problem.floors.tolist()
         return cls(normal_rad, distance_m, problem.heave_m)
+
+    @property
+    def text(self) -> str:
+        """In units of the reader."""
+        waves = f"{1e3 * self.normal_rad:.3g} mrad and {1e3 * self.distance_m:.3g} mm of waves"
+        return f"{waves}, {1e3 * self.heave_m:.3g} mm of heave"
+
+    @property
+    def beyond_ground(self) -> tuple[str, ...]:
+        """A warning: a level is at its limit, which no ground reaches; none if none is."""
+        own = (self.normal_rad, self.distance_m, self.heave_m)
+        most = (MOST.normal_rad, MOST.distance_m, MOST.heave_m)
+        if not any(map(operator.eq, own, most)):
+            return ()
+        return (
+            f"planes of the ground, or heights of the vehicle above it, scatter by {self.text}, "
+            f"and more than {MOST.text} is not taken for ground: roll, pitch and z have little of "
+            "it. Look for ground that is none (a ramp, a kerb, a load in view, vegetation), and "
+            "for a vehicle height (ground.vehicle_height) that is wrong",
+        )
 
 
 MOST = GroundLevels(normal_rad=0.05, distance_m=0.2, heave_m=0.2)

@@ -265,7 +265,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         clocks_apart=found.clocks.apart,
         channels=channel_sizes(found),
     )
-    stated = found.problem.standing
+    stated, frame = found.problem.standing, found.problem.range_errors.frame
     known, offset = prior.parameter_information, prior.parameter_offset
     b, held = system.b, [system.H]
     del found, system, prior
@@ -282,6 +282,8 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     rows[:, own] = rows[:, own] @ by_now
     if tilt is not None:
         tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
+    frames = np.tile(frame, len(names))
+    _spread(both, both_gradient, np.arange(len(keep))[-len(frames) :], frames)
     now = state.errors[stand]
     stance = stance_of(stated, float(now[0]), both, both_gradient, tilt)
     standing = standing_errors(stated, now, both, both_gradient)
@@ -382,6 +384,18 @@ def _marginal(
         np.column_stack([on_keep - follow[:, :-1], follow[:, -1]]),
         known[k + 1 :, k + 1 :],
     )
+
+
+def _spread(H: Array, b: Array, own: IntArray, variances: Array) -> None:
+    """Adds errors with variances (k,) to what a quadratic says of coordinates `own` (k,), in place.
+
+    The quadratic in `d` becomes that in `d + e`, e eliminated by its prior. Variances may be zero.
+    """
+    coupled, pull = H[:, own], b[own]
+    known = np.eye(len(own)) + variances[:, None] * coupled[own]
+    by_errors = np.linalg.solve(known, variances[:, None] * np.column_stack([coupled.T, pull]))
+    H -= coupled @ by_errors[:, :-1]
+    b -= coupled @ by_errors[:, -1]
 
 
 def _parameters(found: Solved) -> dict[str, Array | gtsam.Rot3]:

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.config.range_errors import FRAME_M, FRAME_RAD
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, StructureTerm
 from caliv_graph.structure import problem as problems
@@ -222,6 +223,29 @@ def test_the_term_is_the_marginal_on_fewer_poses_too(solved: Solved) -> None:
     assert fewer / np.outer(scale, scale) == pytest.approx(
         all_of / np.outer(scale, scale), abs=1e-5
     )
+
+
+def test_the_frame_of_walls_and_ground_errs(solved: Solved) -> None:
+    """The covariance of extrinsics is larger by that of the frames; the estimate stays."""
+    frame_m = 2e-3
+    motion = motion_of(solved)
+    known, spread = [], []
+    for own_m, out in ((0.0, known), (frame_m, spread)):
+        errors = replace(solved.problem.range_errors, frame_m=own_m)
+        found = replace(solved, problem=replace(solved.problem, range_errors=errors))
+        term = term_of(found, np.arange(24))
+        H = term.information.copy()
+        H[: len(motion), : len(motion)] += motion
+        H[-12:, -12:] += 1e-6 * np.diag(np.tile(GUESS_SIGMAS**-2.0, 2))  # the height is open
+        out += [information_of(term, motion), np.linalg.solve(H, term.gradient)[-12:]]
+
+    turn_rad = FRAME_RAD * frame_m / FRAME_M
+    frames = np.diag(np.tile(np.repeat([turn_rad, frame_m], 3) ** 2, 2))
+    scale = np.sqrt(np.outer(np.diag(known[0]), np.diag(known[0])))
+    expected = np.linalg.solve(np.eye(12) + known[0] @ frames, known[0])
+    assert spread[0] / scale == pytest.approx(expected / scale, abs=1e-6)
+    assert spread[0][3, 3] < 0.5 * known[0][3, 3]
+    assert spread[1] == pytest.approx(known[1], abs=1e-6)
 
 
 def test_a_term_says_nothing_against_itself(solved: Solved) -> None:

@@ -229,7 +229,8 @@ def test_the_frame_of_walls_and_ground_errs(solved: Solved) -> None:
     """The covariance of extrinsics is larger by that of the frames; the estimate stays."""
     frame_m = 2e-3
     motion = motion_of(solved)
-    known, spread = [], []
+    known: list[Array] = []
+    spread: list[Array] = []
     for own_m, out in ((0.0, known), (frame_m, spread)):
         errors = replace(solved.problem.range_errors, frame_m=own_m)
         found = replace(solved, problem=replace(solved.problem, range_errors=errors))

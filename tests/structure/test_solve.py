@@ -238,7 +238,8 @@ def test_the_frame_of_walls_and_ground_errs(solved: Solved) -> None:
         H = term.information.copy()
         H[: len(motion), : len(motion)] += motion
         H[-12:, -12:] += 1e-6 * np.diag(np.tile(GUESS_SIGMAS**-2.0, 2))  # the height is open
-        out += [information_of(term, motion), np.linalg.solve(H, term.gradient)[-12:]]
+        step = np.asarray(np.linalg.solve(H, term.gradient)[-12:], np.float64)
+        out += [information_of(term, motion), step]
 
     turn_rad = FRAME_RAD * frame_m / FRAME_M
     frames = np.diag(np.tile(np.repeat([turn_rad, frame_m], 3) ** 2, 2))

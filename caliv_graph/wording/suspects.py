@@ -117,7 +117,8 @@ def apart_finding(
         f"{drive}: lidars '{first}' and '{second}': by the surfaces around, the stamps of "
         f"'{second}' are {1e3 * abs(apart_s):.2f} +- {1e3 * sigma_s:.2f} ms {way} than those of "
         f"'{first}' ({sigmas:.0f} sigma), and S2S may be off by how far the vehicle moves "
-        "meanwhile. Synchronise their clocks, or set solve.time_offset",
+        "meanwhile. Synchronise their clocks, or set solve.time_offset; clouds of a whole sweep "
+        "without a time per point look the same",
     )
 
 

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import gtsam
 import numpy as np
+import pytest
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
@@ -92,7 +94,13 @@ def test_halves_of_a_drive_agree() -> None:
     lidars = {**file.lidars, "front": replace(front, T_vehicle_lidar=moved)}
     wrong = with_halves(VALIDATION, replace(file, lidars=lidars), found).verdict
     assert (wrong.word, wrong.contradicts) == ("contradicted", True)
-    assert "S2S of 'front' to 'rear' is elsewhere, y +1" in wrong.reason
+    said = re.search(
+        r"'front' to 'rear' is elsewhere, y (.+) mm at a sigma of (.+)\. A", wrong.reason
+    )
+    assert said
+    off_mm, sigma_mm = map(float, said.groups())
+    assert off_mm == pytest.approx(100.0, abs=3.0 * sigma_mm)
+    assert sigma_mm < 25.0
     # A half that contradicts itself tests nothing.
     doubted = tuple(replace(r, contradictions=("it does",)) for r in found.results)
     assert with_halves(VALIDATION, file, replace(found, results=doubted)) is VALIDATION

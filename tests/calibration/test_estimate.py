@@ -45,11 +45,12 @@ def test_a_result_is_kept_when_the_solve_that_begins_at_it_fails(
     assert run.solution.sensor_noise  # that of the first, too
 
 
-@pytest.mark.parametrize("solves", [1, 3, 4])
+@pytest.mark.parametrize("solves", [3, 4])
 def test_a_result_that_asks_for_one_more_solve_after_the_last_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, solves: int
 ) -> None:
     solve, calls = stages._solved, 0
+    solved: list[Any] = []
 
     def louder(whole: Any, *_: Any) -> Any:
         if calls >= solves:
@@ -60,7 +61,9 @@ def test_a_result_that_asks_for_one_more_solve_after_the_last_says_so(
     def counted(*arguments: Any) -> Any:
         nonlocal calls
         calls += 1
-        return solve(*arguments)
+        if not solved:
+            solved.append(solve(*arguments))
+        return solved[0]
 
     monkeypatch.setattr(stages, "_for_another_solve", louder)
     monkeypatch.setattr(stages, "_solved", counted)

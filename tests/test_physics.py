@@ -141,6 +141,11 @@ def test_clocks_of_lidars_are_compared_with_each_other() -> None:
     (later,) = clock_findings(["drive"], [apart(rear=1.0)], calm)
     assert "ms later than" in later.sentence
     assert clock_findings(["drive"], [apart(rear=0.8)], calm) == ()
+    # Jitter takes up milliseconds, not 5.2 ms: five sigmas with the allowance of 1 ms.
+    severities = [
+        clock_findings(["drive"], [apart(rear=ms)], calm)[0].severity for ms in (5.0, 5.2, -9.0)
+    ]
+    assert severities == ["warning", "contradiction", "contradiction"]
     # One clock that is off is off against all others: one sentence says so.
     (worst,) = clock_findings(["drive"], [apart(rear=1.5, left=2.0)], calm)
     assert worst.input == "lidars.left.time_offset"

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from caliv_graph.products import Finding, Suspect
 from caliv_graph.uncertainty.consistency import (
     CLOCK_BIAS_S,
+    CLOCK_JITTER_S,
     CLOCKS_APART_S,
     CONTRADICTION_SIGMAS,
     DOUBT_SIGMAS,
@@ -97,11 +98,12 @@ def clock_finding(drive: str, lidar: str, late_s: float, sigma_s: float) -> Find
 def apart_finding(
     drive: str, lidars: tuple[str, str], apart_s: float, sigma_s: float
 ) -> Finding | None:
-    """A warning of clocks of two LiDARs that the walls and ground of a drive contradict, or None.
+    """Clocks of two LiDARs that the walls and ground of a drive contradict; None if they do not.
 
-    `apart_s` is how much later the stamps of the second are. No contradiction, however large: where
-    structure is strong, jitter of the stamps takes it up, and S2S is right.
+    `apart_s` is how much later the stamps of the second are. Milliseconds are a warning: where
+    structure is strong, jitter of the stamps takes them up, and S2S is right.
     """
+    beyond_jitter = abs(apart_s) > CONTRADICTION_SIGMAS * math.hypot(sigma_s, CLOCK_JITTER_S)
     sigma_s = math.hypot(sigma_s, CLOCKS_APART_S)
     sigmas = abs(apart_s) / sigma_s
     if sigmas < DOUBT_SIGMAS:
@@ -113,7 +115,7 @@ def apart_finding(
         (apart_s,),
         sigma_s,
         sigmas,
-        "warning",
+        "contradiction" if beyond_jitter else "warning",
         f"{drive}: lidars '{first}' and '{second}': by the surfaces around, the stamps of "
         f"'{second}' are {1e3 * abs(apart_s):.2f} +- {1e3 * sigma_s:.2f} ms {way} than those of "
         f"'{first}' ({sigmas:.0f} sigma), and S2S may be off by how far the vehicle moves "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import gtsam
 import numpy as np
@@ -64,9 +64,7 @@ class GroundLevels:
     @property
     def beyond_ground(self) -> tuple[str, ...]:
         """A warning: a level is at its limit, which no ground reaches; none if none is."""
-        own = (self.normal_rad, self.distance_m, self.heave_m)
-        most = (MOST.normal_rad, MOST.distance_m, MOST.heave_m)
-        if not any(map(operator.eq, own, most)):
+        if not any(map(operator.eq, astuple(self), astuple(MOST))):
             return ()
         return (
             f"planes of the ground, or heights of the vehicle above it, scatter by {self.text}, "

@@ -27,6 +27,7 @@ from caliv_graph.config.range_errors import (
     offset_prior,
     size_weights,
 )
+from caliv_graph.geometry.quadratic import without_errors
 from caliv_graph.geometry.se3 import cross, skew
 from caliv_graph.products import Array
 from caliv_graph.registration.clouds import CloudStack
@@ -219,10 +220,7 @@ def without_bias(
 
     `applied` (B,) are biases with which the clouds were moved back before; None: none.
     """
-    seen = H @ directions
-    factor = scipy.linalg.cho_factor(np.eye(directions.shape[1]) + directions.T @ seen, lower=True)
-    pull = scipy.linalg.cho_solve(factor, _pull(gradient, directions, applied))
-    return H - seen @ scipy.linalg.cho_solve(factor, seen.T), gradient - seen @ pull
+    return without_errors(H, gradient, directions, _pull(gradient, directions, applied))
 
 
 def most_likely_biases(

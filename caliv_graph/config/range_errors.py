@@ -93,9 +93,8 @@ class RangeErrors:
 
     @property
     def frame(self) -> Array:
-        """(6,) variances of turn (rad^2) and shift (m^2) of the frame of walls and ground."""
-        turn_rad = FRAME_RAD * self.frame_m / FRAME_M
-        return np.repeat([turn_rad**2, self.frame_m**2], 3)
+        """(6,) 1 sigma of turn (rad) and shift (m) of the frame of walls and ground."""
+        return np.repeat([FRAME_RAD * self.frame_m / FRAME_M, self.frame_m], 3)
 
     @property
     def offsets(self) -> SizePrior:

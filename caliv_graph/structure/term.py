@@ -15,6 +15,7 @@ from caliv_graph.common.memory import give_back_freed_memory
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.config.range_errors import range_errors
+from caliv_graph.geometry.quadratic import without_errors
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Strip, StructureTerm
 from caliv_graph.structure.align import align_patches
@@ -282,8 +283,9 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     rows[:, own] = rows[:, own] @ by_now
     if tilt is not None:
         tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
-    frames = np.tile(frame, len(names))
-    _spread(both, both_gradient, np.arange(len(keep))[-len(frames) :], frames)
+    frames = np.zeros((len(both), 6 * len(names)))
+    frames[len(keep) - frames.shape[1] : len(keep)] = np.diag(np.tile(frame, len(names)))
+    both, both_gradient = without_errors(both, both_gradient, frames)
     now = state.errors[stand]
     stance = stance_of(stated, float(now[0]), both, both_gradient, tilt)
     standing = standing_errors(stated, now, both, both_gradient)
@@ -384,18 +386,6 @@ def _marginal(
         np.column_stack([on_keep - follow[:, :-1], follow[:, -1]]),
         known[k + 1 :, k + 1 :],
     )
-
-
-def _spread(H: Array, b: Array, own: IntArray, variances: Array) -> None:
-    """Adds errors with variances (k,) to what a quadratic says of coordinates `own` (k,), in place.
-
-    The quadratic in `d` becomes that in `d + e`, e eliminated by its prior. Variances may be zero.
-    """
-    coupled, pull = H[:, own], b[own]
-    known = np.eye(len(own)) + variances[:, None] * coupled[own]
-    by_errors = np.linalg.solve(known, variances[:, None] * np.column_stack([coupled.T, pull]))
-    H -= coupled @ by_errors[:, :-1]
-    b -= coupled @ by_errors[:, -1]
 
 
 def _parameters(found: Solved) -> dict[str, Array | gtsam.Rot3]:

@@ -95,7 +95,7 @@ def test_halves_of_a_drive_agree() -> None:
     wrong = with_halves(VALIDATION, replace(file, lidars=lidars), found).verdict
     assert (wrong.word, wrong.contradicts) == ("contradicted", True)
     said = re.search(
-        r"'front' to 'rear' is elsewhere, y (.+) mm at a sigma of (.+)\. A", wrong.reason
+        r"S2S of 'front' to 'rear' is elsewhere, y \+(.+) mm at a sigma of (.+)\. A", wrong.reason
     )
     assert said
     off_mm, sigma_mm = map(float, said.groups())

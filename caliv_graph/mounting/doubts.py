@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import gtsam
@@ -20,12 +20,12 @@ from caliv_graph.config.lidars import FoundLidarConfig
 from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.mounting.place import View, in_level_axes, view_of
-from caliv_graph.mounting.sharpness import Sightings, difference_m, sharpest_near
+from caliv_graph.mounting.sharpness import difference_m, sharpest_near
 from caliv_graph.products import Array, Recording
 from caliv_graph.targets.search.find import scans_to_read
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 
-Kind = Literal["exchanged", "turned", "heading", "mirrored"]
+Kind = Literal["exchanged", "turned", "heading", "mirrored", "left_handed"]
 
 SHARPER = 1.6
 """Times as many points at one place from which a mistake is said. Measured on an arc and an S-curve
@@ -48,7 +48,8 @@ class Doubt:
         name: of its recording.
         kind: `exchanged`: two LiDARs have each other's guess. `turned`: the guess of one is.
             `heading`: that of the vehicle is, against its path. `mirrored`: the path turns right
-            where the vehicle turned left.
+            where the vehicle turned left, or all clouds are left-handed, which looks the same.
+            `left_handed`: the clouds have x forward, y to the right and z up.
         lidars: whose maps become sharper.
         turn_deg: of `turned` and `heading`: of the guess or the heading against the right one,
             counted to the left.
@@ -68,12 +69,17 @@ class Doubt:
 
 @dataclass(frozen=True)
 class _Trial:
-    """A mistake undone: mountings of some LiDARs, and whether the way is mirrored."""
+    """A mistake undone: mountings of some LiDARs, and the way or the clouds in a mirror."""
 
     kind: Kind
     turn_deg: int
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
-    mirrored: bool = False
+
+    def undone(self, view: View) -> View:
+        """What a LiDAR sees without the mistake."""
+        if self.kind == "mirrored":
+            return replace(view, sightings=view.sightings.mirrored)
+        return view.right_handed if self.kind == "left_handed" else view
 
 
 def doubts(
@@ -131,13 +137,12 @@ def _of_drive(
 ) -> Doubt | None:
     """The mistake whose undoing sharpens the maps most; None if none does by much."""
     guesses = {n: config.lidars[n].guess() for n in views}
-    now = {n: _sharpness(views[n].sightings, views[n], T)[0] for n, T in guesses.items()}
+    now = {n: _sharpness(views[n], T)[0] for n, T in guesses.items()}
     best: tuple[float, float, _Trial, dict[str, float]] | None = None
     for trial in _trials(guesses, given):
         then, moved_m = {}, 0.0
         for n, T in trial.T_vehicle_lidar.items():
-            seen = views[n].sightings.mirrored if trial.mirrored else views[n].sightings
-            then[n], off_m = _sharpness(seen, views[n], T)
+            then[n], off_m = _sharpness(trial.undone(views[n]), T)
             moved_m += off_m
         gains = np.array([then[n] / now[n] for n in then])
         if not _explains(gains, trial.kind):
@@ -160,12 +165,10 @@ def _explains(gains: Array, kind: Kind) -> bool:
     return bool(gains.min() >= SHARPER)
 
 
-def _sharpness(
-    sightings: Sightings, view: View, T_vehicle_lidar: gtsam.Pose3
-) -> tuple[float, float]:
+def _sharpness(view: View, T_vehicle_lidar: gtsam.Pose3) -> tuple[float, float]:
     """The sharpness near a mounting, and how far from it, metres at 15 m."""
     start = in_level_axes(view, T_vehicle_lidar)
-    found, sharing = sharpest_near(sightings, start)
+    found, sharing = sharpest_near(view.sightings, start)
     return sharing, difference_m(found, start)
 
 
@@ -187,4 +190,9 @@ def _trials(guesses: Mapping[str, gtsam.Pose3], given: bool) -> Iterator[_Trial]
         turned = gtsam.Pose3(gtsam.Rot3.Yaw(-math.radians(turn)), np.zeros(3))
         yield _Trial("heading", turn, {name: turned.compose(T) for name, T in guesses.items()})
     if given:
-        yield _Trial("mirrored", 0, guesses, mirrored=True)
+        yield _Trial("mirrored", 0, guesses)
+    elif len(guesses) > 1:
+        yield _Trial("left_handed", 0, guesses)
+    if not given or len(guesses) > 1:
+        for name, T in guesses.items():
+            yield _Trial("left_handed", 0, {name: T})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -135,6 +135,13 @@ class View:
 
     ground: Ground
     sightings: Sightings
+
+    @property
+    def right_handed(self) -> View:
+        """What it saw if the y of its clouds points to the right: x forward, z up, left-handed."""
+        level = replace(self.sightings, level=self.sightings.level.conj())
+        up = self.ground.up_lidar * np.array([1.0, -1.0, 1.0])
+        return View(replace(self.ground, up_lidar=up), level)
 
 
 def _turned_rad(trajectory: VehicleTrajectory) -> float:

@@ -14,7 +14,9 @@ import gtsam
 import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array
+from caliv_graph.trajectory.chain import UNDETERMINED
 from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK, SmootherInput
 
 XYZ = ("x", "y", "z")
@@ -214,9 +216,16 @@ def _imu_late(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, inertial=inertial, late_ns=late)
 
 
+DIVERGED_S = 10.0
+"""A clock that seems to be this late was estimated from what no motion explains: the linearisation
+has no validity there."""
+
+
 def _later(data: SmootherInput, clock: str, d: Array) -> dict[str, int]:
-    by_ns = round(float(d[0]) * NANOSECONDS_PER_SECOND)
-    return {**data.late_ns, clock: data.late_ns.get(clock, 0) + by_ns}
+    late_s = data.late_ns.get(clock, 0) / NANOSECONDS_PER_SECOND + float(d[0])
+    if not abs(late_s) < DIVERGED_S:
+        raise TrajectoryError(f"{UNDETERMINED}. Stamps of the {clock} seem {late_s:.3g} s late")
+    return {**data.late_ns, clock: round(late_s * NANOSECONDS_PER_SECOND)}
 
 
 GNSS_TIME_OFFSET = InputParameter(

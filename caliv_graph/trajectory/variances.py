@@ -20,6 +20,7 @@ import scipy.sparse
 from scipy.optimize import OptimizeResult, minimize
 
 from caliv_graph.conventions import key_yaw_bias
+from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.trajectory.build import build_graph, to_values
 from caliv_graph.trajectory.chain import STATE, Chain, beside
@@ -289,6 +290,10 @@ def _expected(part: _Part, step: Array, moments: Chain) -> float:
     return float(total)
 
 
+TOO_FAR = 1e6
+"""-2 log likelihood, beyond that of the stated noise, where it cannot be worked out."""
+
+
 def contradicted(likelihood: NoiseLikelihood) -> dict[str, float]:
     """The scales that the data set against the stated sigmas; all others are 1."""
     names = set(likelihood.names)
@@ -315,7 +320,13 @@ def fit(
 
     def cost(x: Array) -> tuple[float, Array]:
         logarithms[at] = x
-        value, slope = likelihood.at(np.exp(logarithms)) if x.any() else likelihood.as_stated
+        try:
+            value, slope = likelihood.at(np.exp(logarithms)) if x.any() else likelihood.as_stated
+        except TrajectoryError:
+            if not x.any():
+                raise
+            # Levels so far apart that numbers do not tell the states: the search turns back.
+            return TOO_FAR * (1.0 + float(x @ x)), 2.0 * TOO_FAR * x
         # Less the value at the start: the optimiser's tolerance is relative.
         return (
             value - begin + float(x @ x) / LOG_SPREAD**2,

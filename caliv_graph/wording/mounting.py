@@ -85,6 +85,13 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
             "Without this turn",
             _heading_remedy(found, config),
         )
+    if found.kind == "left_handed":
+        whose = "the clouds" if len(names) > 1 else f"the clouds of lidar {names[0]}"
+        return (
+            f"{whose} are left-handed: y points to the right, with x forward and z up",
+            "With the sign of y changed",
+            "Write the points with y to the left; simulators and converters often leave it",
+        )
     remedy = "Set data.pose_axes: ned"
     if config.data.format == "caliv":
         remedy = (
@@ -92,10 +99,10 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
             "with z up"
         )
     return (
-        "the poses are of a map with z down (north, east, down): the vehicle turns right where "
-        "they turn left",
-        "In a map with z up",
-        remedy,
+        "the poses are of a map with z down (north, east, down), or all clouds are left-handed (y "
+        "to the right): the vehicle turns right where they turn left",
+        "With one of them mirrored",
+        f"{remedy}; or, if the poses are right, write the points with y to the left",
     )
 
 

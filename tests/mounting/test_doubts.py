@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import cast
 
 import gtsam
 import numpy as np
@@ -14,8 +15,9 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import Config
 from caliv_graph.mounting.doubts import Doubt, doubts
 from caliv_graph.mounting.place import place_lidars
-from caliv_graph.products import Trajectory
+from caliv_graph.products import LidarScan, Trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.wording.mounting import mistake_sentence
 from tests.mounting.posts import Drive, config_of, views_kept
 
@@ -91,6 +93,47 @@ def test_poses_of_north_east_down() -> None:
     text = mistake_sentence(doubt, GUESSES)
     assert "a map with z down" in text
     assert "Set data.pose_axes: ned" in text
+
+
+def left_handed(*names: str) -> Drive:
+    """The drive, y of the clouds of some LiDARs to the right."""
+
+    class Mirrored(Drive):
+        def scan(self, lidar: str, stamp: int) -> LidarScan:
+            scan = DRIVE.scan(lidar, stamp)
+            if lidar not in names:
+                return scan
+            return replace(scan, points_lidar=scan.points_lidar * [1.0, -1.0, 1.0])
+
+    return Mirrored(DRIVE.mountings)
+
+
+def test_left_handed_clouds_of_one_lidar() -> None:
+    (doubt,) = doubts([left_handed("rear")], [DRIVE.way], GUESSES, SilentProgress())
+    assert (doubt.kind, doubt.lidars) == ("left_handed", ("rear",))
+    assert "the clouds of lidar 'rear' are left-handed" in mistake_sentence(doubt, GUESSES)
+
+
+def test_left_handed_clouds_of_all_lidars_on_a_path_of_the_sensors_of_motion() -> None:
+    class Estimated:
+        """A path that nobody gave."""
+
+        span_ns, lost_ns = DRIVE.way.span_ns, DRIVE.way.lost_ns
+        poses_at = staticmethod(DRIVE.way.poses_at)
+
+    drive = left_handed("front", "rear")
+    way = cast("SmoothedTrajectory", Estimated())
+    (doubt,) = doubts([drive], [way], GUESSES, SilentProgress())
+    assert (doubt.kind, doubt.lidars) == ("left_handed", ("front", "rear"))
+    assert "most likely, the clouds are left-handed" in mistake_sentence(doubt, GUESSES)
+
+
+def test_left_handed_clouds_of_all_lidars_look_like_poses_of_north_east_down() -> None:
+    drive = left_handed("front", "rear")
+    (doubt,) = doubts([drive], [DRIVE.way], GUESSES, SilentProgress())
+    assert (doubt.kind, doubt.lidars) == ("mirrored", ("front", "rear"))
+    assert "or all clouds are left-handed" in mistake_sentence(doubt, GUESSES)
+    assert "write the points with y to the left" in mistake_sentence(doubt, GUESSES)
 
 
 def test_a_mistake_of_the_config_is_said_once_of_several_drives() -> None:

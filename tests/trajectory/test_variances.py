@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import cast
 
 import numpy as np
 import pytest
 
 from caliv_graph.conventions import key_bias, key_imu, key_velocity
+from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray, MotionData
 from caliv_graph.trajectory.build import build_graph
-from caliv_graph.trajectory.chain import STATE
+from caliv_graph.trajectory.chain import STATE, UNDETERMINED
 from caliv_graph.trajectory.chain_solution import inverse_in_blocks, solved
 from caliv_graph.trajectory.correlated import CorrelatedError, unit_information
 from caliv_graph.trajectory.effects import (
@@ -24,7 +26,7 @@ from caliv_graph.trajectory.noise import configured_errors
 from caliv_graph.trajectory.select import noise_scales
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.variances import NoiseLikelihood, free_components
+from caliv_graph.trajectory.variances import NoiseLikelihood, fit, free_components
 from tests.trajectory.motions import Course, Sensors, arc_drive, config_for, record, rows_of, stamps
 from tests.trajectory.test_chain import random_chain
 
@@ -200,6 +202,32 @@ def test_the_slope_of_the_likelihood_is_right() -> None:
         moved = [scales * np.exp(1e-4 * s * np.eye(6)[i]) for s in (1.0, -1.0)]
         more, less = (likelihood.at(at)[0] for at in moved)
         assert slope[i] == pytest.approx((more - less) / 2e-4, rel=1e-3, abs=1e-2)
+
+
+def test_levels_whose_likelihood_cannot_be_worked_out_are_no_end_of_the_fit() -> None:
+    """A jump of the fixes made the search try levels at which the chain is not positive."""
+    tried = []
+
+    class Likelihood:
+        names = ("gnss_horizontal", "velocity")
+        best = np.array([0.4, -0.3])
+
+        def at(self, scales: Array) -> tuple[float, Array]:
+            x = np.log(scales)
+            tried.append(x)
+            if np.abs(x).max() > 0.6:
+                raise TrajectoryError(UNDETERMINED)
+            off = x - self.best
+            return 1e3 * float(off @ off), 2e3 * off
+
+        @property
+        def as_stated(self) -> tuple[float, Array]:
+            return self.at(np.ones(2))
+
+    scales, _ = fit(cast("NoiseLikelihood", Likelihood()), set(Likelihood.names))
+
+    assert max(np.abs(x).max() for x in tried) > 0.6
+    assert np.log(list(scales.values())) == pytest.approx(Likelihood.best, abs=0.01)
 
 
 def shifted(motion: MotionData, north_m: Array) -> MotionData:

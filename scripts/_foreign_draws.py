@@ -15,6 +15,7 @@ EFFECTS: Mapping[str, str] = {
     "uneven": "waves, bumps and grain of the ground",
     "crown": "crown of a street",
     "kerbs": "kerbs of a street",
+    "grass": "grass that beams do not pass",
     "movers": "a walker and a passing car",
     "lever_arm": "errors of the lever arms that the config states",
     "imu_noise": "white noise of the IMU",

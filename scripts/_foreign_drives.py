@@ -37,6 +37,7 @@ from scripts._foreign_vehicle import (
 from scripts._foreign_world import (
     TARGETS,
     Array,
+    Grass,
     Ground,
     Mesh,
     Mover,
@@ -83,6 +84,7 @@ class Scenario:
         slope_deg: of the ground.
         hill_m: height of a hill in the middle of the path.
         kerbs: whether a street has some.
+        grass_m: mean height of what beams meet of grass above the soil; 0: none.
         walker: whether somebody crosses.
         traffic: whether a car passes.
     """
@@ -105,6 +107,7 @@ class Scenario:
     slope_deg: float = 0.6
     hill_m: float = 0.0
     kerbs: bool = False
+    grass_m: float = 0.0
     walker: bool = False
     traffic: bool = False
 
@@ -142,7 +145,10 @@ def make_drive(draws: Draws, scenario: Scenario) -> Drive:
     if scenario.box_m is not None:
         body = Mesh()
         body.box(*scenario.box_m)
-    return Drive(motion, Scene(still, movers, body), targets)
+    grass = None
+    if scenario.grass_m:
+        grass = Grass(draws.stream("grass"), ground, scenario.grass_m)
+    return Drive(motion, Scene(still, movers, body, grass), targets)
 
 
 def _place_targets(
@@ -520,6 +526,18 @@ SCENARIOS: dict[str, Scenario] = {
     ),
     "noimu": Scenario(
         SWING_EIGHT, ROOF, imu=None, yaw_rate=True, gnss=Gnss(rate_hz=10), targets=()
+    ),
+    "meadow": Scenario(
+        SWING_EIGHT,
+        {
+            "mast": replace(ROOF_LEFT, xyz_m=(1.9, 0.0, 2.3), rpy_deg=(1.0, 12.0, 2.0)),
+            "hood": Lidar((2.6, -0.1, 1.3), (0, 6, -2), "solid", 90, columns=420, phase_s=0.03),
+        },
+        "open",
+        body=Body(wheelbase_m=2.6, track_m=1.7),
+        targets=("bin",),
+        grass_m=0.03,
+        uneven=1.5,
     ),
     "straightish": Scenario(STRAIGHT, ROOF, "street", clear_m=6, targets=(), kerbs=True),
 }

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from scripts._foreign_draws import Draws
 from scripts._foreign_vehicle import Motion
-from scripts._foreign_world import Array, IntArray, Mesh, Mover
+from scripts._foreign_world import Array, Grass, IntArray, Mesh, Mover
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -179,10 +179,14 @@ class Scene:
         still: in the world.
         movers: in the world.
         body: in the axle frame.
+        grass: on the ground; None: the ground is bare.
     """
 
-    def __init__(self, still: Mesh, movers: list[Mover], body: Mesh | None) -> None:
+    def __init__(
+        self, still: Mesh, movers: list[Mover], body: Mesh | None, grass: Grass | None = None
+    ) -> None:
         self._still = _ray_scene(still)
+        self.grass = grass
         self._movers = [(mover, _ray_scene(mover.mesh)) for mover in movers]
         self._body = None if body is None else _ray_scene(body)
 
@@ -262,6 +266,7 @@ def scan(draws: Draws, name: str, lidar: Lidar, motion: Motion, scene: Scene) ->
     rng = draws.stream(f"lidar {name}")
     at_edges = draws.stream(f"edges {name}")  # others draw the same without edges
     dropped = draws.stream(f"dropouts {name}")
+    in_grass = draws.stream(f"grass {name}")
     channels = lidar.channels if lidar.kind in ("spinning", "solid") else SCAN_GROUPS
     range_error = draws.on("channel_range") * 0.003 * rng.normal(size=channels)
     range_error += draws.on("range_bias") * 0.004 * rng.normal()
@@ -273,7 +278,9 @@ def scan(draws: Draws, name: str, lidar: Lidar, motion: Motion, scene: Scene) ->
         sent = beams(lidar, k)
         real = sent.directions(angle_error[:, sent.channel])
         moving = _Moving(lidar, motion, start_s, sent.time_s)
-        ranges, cosines = scene.cast(moving.rays(real))
+        ranges, cosines = scene.cast(rays := moving.rays(real))
+        if scene.grass is not None and draws.on("grass"):
+            ranges = scene.grass.seen(in_grass, rays.origin, rays.direction, ranges, cosines)
         if draws.on("edges"):
             ranges = _at_edges(at_edges, lidar, scene, moving, real, ranges, cosines)
         cosines = np.maximum(cosines, 0.03)

@@ -311,6 +311,38 @@ class Ground:
         return m
 
 
+class Grass:
+    """Blades on the ground that return beams above the soil that carries the wheels.
+
+    Args:
+        rng: of the patches in which it is higher and lower.
+        ground: that it grows on.
+        mean_m: height of the returns above the soil.
+    """
+
+    def __init__(self, rng: np.random.Generator, ground: Ground, mean_m: float) -> None:
+        patches = gaussian_filter(rng.normal(size=ground.heights.shape), 0.6 / CELL_M)
+        heights = mean_m * np.exp(0.35 * patches / patches.std())
+        self._soil, self._blades = ground, Ground(ground.xs, ground.ys, heights)
+
+    def seen(
+        self,
+        rng: np.random.Generator,
+        origin: Array,
+        direction: Array,
+        ranges: Array,
+        cosines: Array,
+    ) -> Array:
+        """Ranges (n,) of rays (n, 3), those that meet soil less what they miss of it."""
+        at = origin + np.where(np.isfinite(ranges), ranges, 0.0)[:, None] * direction
+        low = [self._soil.xs[0], self._soil.ys[0]], [self._soil.xs[-1], self._soil.ys[-1]]
+        xy = np.clip(at[:, :2], *low)
+        soil = np.isfinite(ranges) & (np.abs(at[:, 2] - self._soil.z(xy)) < 0.03)
+        lift = self._blades.z(xy) * rng.gamma(2.0, 0.5, len(ranges))
+        # Flat beams meet blades on their way; beyond a metre they would have gone between them.
+        return np.where(soil, ranges - np.minimum(lift / np.maximum(cosines, 0.03), 1.0), ranges)
+
+
 def make_ground(
     rng: np.random.Generator,
     path: Array,

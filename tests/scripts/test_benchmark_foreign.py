@@ -22,7 +22,7 @@ from scripts._foreign_draws import EFFECTS, Draws
 from scripts._foreign_drives import SCENARIOS, simulate
 from scripts._foreign_lidar import Kind, Lidar, Scene, Sweep, scan
 from scripts._foreign_vehicle import Gnss, Imu, Motion, measure_gnss, measure_imu
-from scripts._foreign_world import Array, Mesh
+from scripts._foreign_world import Array, Grass, Ground, Mesh
 
 SCRIPTS = Path(benchmark.__file__).parent
 WALL_X_M = 8.0
@@ -85,6 +85,25 @@ def test_an_effect_of_a_lidar_changes_nothing_else(motion: Motion, wall: Scene) 
     for some, every in zip(scanned(), scanned("dropouts"), strict=True):
         assert len(some.points) < len(every.points)
         assert set(map(tuple, some.points)) < set(map(tuple, every.points))
+
+
+def test_grass_lifts_what_is_seen_of_the_ground_and_of_nothing_else(motion: Motion) -> None:
+    xs = np.arange(-40.0, 40.0, 0.5)
+    ground, mesh = Ground(xs, xs, np.zeros((len(xs), len(xs)))), Mesh()
+    mesh.box((WALL_X_M + 0.5, 0.0, 15.0), (1.0, 60.0, 30.0))
+    mesh.add(*ground.mesh().arrays())
+    grass = Grass(np.random.default_rng(1), ground, 0.03)
+    lidar = replace(a_lidar("spinning"), max_range_m=12.0, fov_deg=(-40.0, 30.0))
+    draws = Draws("lawn", 1, ALL - {"grass"})
+
+    sweeps = list(scan(draws, "front", lidar, motion, Scene(mesh, [], None, grass)))
+
+    x, _, z = np.concatenate([in_world(lidar, motion, sweep) for sweep in sweeps]).T
+    below = z[(z < 0.5) & (x < WALL_X_M - 0.5)]
+    assert len(below) > 1000
+    assert below.mean() == pytest.approx(0.03, abs=0.006)
+    assert below.min() > -1e-4
+    np.testing.assert_allclose(x[z > 0.5], WALL_X_M, atol=1e-3)
 
 
 def test_a_stretch_of_worse_fixes_is_the_only_one_that_changes(motion: Motion) -> None:

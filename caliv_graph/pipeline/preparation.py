@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -38,7 +39,7 @@ from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.readers.empty import CountedRecording
 from caliv_graph.readers.pose_pauses import without_pauses
 from caliv_graph.structure.patches import DrivePatches
-from caliv_graph.structure.read import read_patches
+from caliv_graph.structure.read import ground_roughness_m, read_patches
 from caliv_graph.structure.without_targets import without_targets
 from caliv_graph.targets.cloud.extract import extract_targets
 from caliv_graph.targets.ground.measure import measure_grounds
@@ -57,7 +58,7 @@ from caliv_graph.wording.mounting import (
     region_sentence,
 )
 from caliv_graph.wording.odometry import odometry_sentence
-from caliv_graph.wording.structure import no_target_sentence
+from caliv_graph.wording.structure import no_target_sentence, rough_ground_sentence
 from caliv_graph.wording.suspects import motion_sentence
 
 
@@ -71,7 +72,8 @@ class Prepared:
         grounds: the ground as the LiDARs saw it.
         findings: values of the config that the raw data contradict.
         warnings: for the user, a line each.
-        config: the config, with the guesses that the search for the target had to replace.
+        config: the config, with the guesses that the search for the target had to replace, and a
+            larger sigma of the height on grass.
         contradictions: how guesses and stamps contradict what the LiDARs see, a sentence each.
         patches: pieces of walls and other surfaces, per drive; empty: structure is not used.
         no_target: why no target was found; None: one was, or none was to be looked for.
@@ -151,6 +153,7 @@ def prepare(
         without_targets(of, observations, rough[of.drive], config)
         for of in _patches(recordings, rough, config, progress)
     )
+    config, on_grass = _on_rough_ground(config, recordings, patches, rough)
     kept = kept_stamps(patches, usable(observations))
     if no_target is not None and not kept:
         raise no_target
@@ -174,6 +177,7 @@ def prepare(
     warnings += [w for o in observations for w in o.warnings]
     if no_target is not None:
         warnings.append(no_target_sentence(no_target.what))
+    warnings += on_grass
     return Prepared(
         tuple(trajectories),
         tuple(observations),
@@ -278,6 +282,40 @@ def _patches(
     if not _uses(config):
         return ()
     return read_patches(recordings, trajectories, config, progress, keep_level=True)
+
+
+ROUGH_M = 0.008
+"""Scatter of the ground from which it is no road. LiDARs see roads scatter by 1 to 5 mm."""
+
+LIFT = 1.5
+"""Height of what LiDARs see of grass above the soil, over its scatter: blades have all lengths, and
+what they see of them begins at the soil."""
+
+
+def _on_rough_ground(
+    config: Config,
+    recordings: Sequence[Recording],
+    patches: Sequence[DrivePatches],
+    trajectories: Sequence[VehicleTrajectory],
+) -> tuple[Config, tuple[str, ...]]:
+    """The config with a larger sigma of the height where the ground is grass or gravel; warnings.
+
+    Wheels stand lower there than what LiDARs see of the ground, all along the drive.
+    """
+    ground = config.ground
+    if not ground.use or ground.vehicle_height is None:
+        return config, ()
+    guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
+    used_m, lines = ground.sigma, []
+    for of in patches:
+        rough_m = ground_roughness_m(of, trajectories[of.drive], guesses)
+        if rough_m is not None and rough_m > ROUGH_M:
+            sigma_m = math.hypot(ground.sigma, LIFT * rough_m)
+            name = recordings[of.drive].name
+            lines.append(rough_ground_sentence(name, rough_m, ground.sigma, sigma_m))
+            used_m = max(used_m, sigma_m)
+    known = ground.model_copy(update={"sigma": used_m})
+    return config.model_copy(update={"ground": known}), tuple(lines)
 
 
 def _with_cause(

@@ -88,12 +88,29 @@ MOST_FITTED = 0.9
 def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
     """(L,) noise along the beam of each LiDAR, from the scatter of patches about their planes.
 
-    The variance of a patch is `sigma_r^2 cos^2 + (d sigma_b)^2 sin^2 + roughness^2`, d the
-    distance: noise along the beam, noise of its direction and roughness are told apart by incidence
-    and distance. None of the three is assumed: with 0.3 mrad of beams that have none, walls at 30 m
+    Noise along the beam, noise of its direction and roughness are told apart by incidence and
+    distance. None of the three is assumed: with 0.3 mrad of beams that have none, walls at 30 m
     left nothing for a range noise of 9 mm, and its part in the tilt of strips stayed (S2S pitch
-    0.16 mrad off at a claimed 0.05). Medians, as patches of leaves scatter more. What is stated
-    where there are too few patches.
+    0.16 mrad off at a claimed 0.05). What is stated where there are too few patches.
+    """
+    out = np.full(len(patches.lidars), stated_m)
+    for i, found in enumerate(_scatter_parts(patches, np.ones(len(patches.scan), dtype=bool))):
+        if found is not None:
+            out[i] = math.sqrt(max(float(found[0]), LEAST_RANGE_M**2))
+    return out
+
+
+def roughness_m(patches: DrivePatches, of: BoolArray) -> Array:
+    """(L,) scatter of the surface itself across some patches (N,); nan where too few are seen."""
+    parts = _scatter_parts(patches, of)
+    return np.array([math.nan if found is None else math.sqrt(found[2]) for found in parts])
+
+
+def _scatter_parts(patches: DrivePatches, of: BoolArray) -> list[Array | None]:
+    """Per LiDAR the (3,) variances of `_variance_parts` in patches (N,); None where too few.
+
+    The variance of a patch is `sigma_r^2 cos^2 + (d sigma_b)^2 sin^2 + roughness^2`, d the
+    distance. Medians of classes, as patches of leaves scatter more.
     """
     centres = patches.centres_lidar
     distance = np.linalg.norm(centres, axis=1)
@@ -101,21 +118,19 @@ def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
     free = np.maximum(patches.points - 3.0, 1.0)
     # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
     variance = patches.scatter_m**2 / (1.0 - 2.0 / (9.0 * free)) ** 3
-    out = np.full(len(patches.lidars), stated_m)
-    for i in range(len(out)):
-        own = np.flatnonzero(
-            (patches.scan_lidar[patches.scan] == i) & (patches.points >= LEAST_POINTS)
-        )
-        if len(own) >= LEAST_PATCHES * INCIDENCES * DISTANCES:
-            medians = [
-                [np.median(of[part]) for of in (cos, distance, variance)]
-                for group in np.array_split(own[np.argsort(cos[own], kind="stable")], INCIDENCES)
-                for part in np.array_split(
-                    group[np.argsort(distance[group], kind="stable")], DISTANCES
-                )
-            ]
-            found = _variance_parts(*np.array(medians).T)
-            out[i] = math.sqrt(max(float(found[0]), LEAST_RANGE_M**2))
+    of = of & (patches.points >= LEAST_POINTS)
+    out: list[Array | None] = []
+    for i in range(len(patches.lidars)):
+        own = np.flatnonzero(of & (patches.scan_lidar[patches.scan] == i))
+        if len(own) < LEAST_PATCHES * INCIDENCES * DISTANCES:
+            out.append(None)
+            continue
+        medians = [
+            [np.median(of_class[part]) for of_class in (cos, distance, variance)]
+            for group in np.array_split(own[np.argsort(cos[own], kind="stable")], INCIDENCES)
+            for part in np.array_split(group[np.argsort(distance[group], kind="stable")], DISTANCES)
+        ]
+        out.append(_variance_parts(*np.array(medians).T))
     return out
 
 

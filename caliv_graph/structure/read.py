@@ -15,6 +15,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
 from caliv_graph.structure.channels import ChannelSums
+from caliv_graph.structure.noise import roughness_m
 from caliv_graph.structure.patches import DrivePatches, Swept
 from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
 from caliv_graph.targets.cloud.views import evenly_spread
@@ -131,6 +132,24 @@ def level(
     if not len(patches.scan):
         return np.zeros(0, dtype=bool)
     return _is_level(patches.normal_lidar, _up(patches, trajectory, T_vehicle_lidar))
+
+
+def ground_roughness_m(
+    patches: DrivePatches,
+    trajectory: VehicleTrajectory,
+    T_vehicle_lidar: Mapping[str, gtsam.Pose3],
+) -> float | None:
+    """Scatter of the ground about pieces of half a metre, 1 sigma, beside the noise of the LiDARs.
+
+    That of the LiDAR that sees the least of it: an error of its own is none of the ground. None: no
+    LiDAR sees enough ground.
+
+    Raises:
+        TrajectoryError: a scan is outside the trajectory's span.
+    """
+    found = roughness_m(patches, level(patches, trajectory, T_vehicle_lidar))
+    found = found[np.isfinite(found)]
+    return float(found.min()) if len(found) else None
 
 
 def lidars_above_ground(

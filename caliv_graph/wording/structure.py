@@ -15,6 +15,16 @@ def nothing_sentence(what: str, structure: str) -> str:
     return f"{what}. Structure does not replace it: {structure}"
 
 
+def rough_ground_sentence(drive: str, roughness_m: float, sigma_m: float, used_m: float) -> str:
+    """The warning that the ground seen may not be what carries the wheels; sigmas of the height."""
+    return (
+        f"{drive}: the ground scatters by {1e3 * roughness_m:.0f} mm from point to point, as grass "
+        "or gravel does: LiDARs see its tips, wheels sink in. ground.vehicle_height is believed to "
+        f"{1e3 * used_m:.0f} mm in place of ground.sigma ({1e3 * sigma_m:.3g} mm), and z of all "
+        "LiDARs with it. Record a drive on asphalt or concrete for z"
+    )
+
+
 def shared_walls_sentence(a: str, b: str, strips: int, walls: Sequence[str] = ()) -> str:
     """How many strips of walls two LiDARs both see, and what follows if there are none."""
     if not strips:

@@ -1,0 +1,89 @@
+"""Grass: LiDARs see its tips, wheels stand on the soil."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from caliv_graph.config.model import Config
+from caliv_graph.pipeline.preparation import LIFT, ROUGH_M, _on_rough_ground
+from caliv_graph.products import Array, Recording
+from caliv_graph.structure.noise import roughness_m
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.read import ground_roughness_m, level
+from tests.structure.test_align import TRAJECTORY, TRUTH, in_yard
+from tests.structure.test_noise import patches_of
+
+GRASS_M = 0.012
+
+
+def on_grass(seeing: Collection[str]) -> DrivePatches:
+    """The yard, its ground rougher as some LiDARs see it."""
+    patches = in_yard()
+    seen = np.isin(np.array(patches.lidars)[patches.scan_lidar[patches.scan]], list(seeing))
+    rough: Array = np.where(level(patches, TRAJECTORY, TRUTH) & seen, GRASS_M, 0.0)
+    return replace(patches, scatter_m=np.hypot(patches.scatter_m, rough))
+
+
+def config_of(**ground: object) -> Config:
+    lidars = {}
+    for name, T in TRUTH.items():
+        rpy = np.degrees(T.rotation().rpy()).tolist()
+        guess = {"xyz": T.translation().tolist(), "rpy_deg": rpy}
+        lidars[name] = {"topic": f"/{name}", "initial": guess}
+    return Config.model_validate({"lidars": lidars, "ground": ground})
+
+
+class Named:
+    name = "meadow"
+
+
+def prepared(patches: DrivePatches, **ground: object) -> tuple[float, tuple[str, ...]]:
+    """Sigma of the height that is used, and what is said."""
+    recordings = [cast("Recording", Named())]
+    config, said = _on_rough_ground(config_of(**ground), recordings, [patches], [TRAJECTORY])
+    return config.ground.sigma, said
+
+
+@pytest.mark.parametrize("rough_m", [0.0, 0.005, 0.02])
+def test_roughness_is_told_from_noise_along_and_across_the_beams(rough_m: float) -> None:
+    patches = patches_of(0.01, 1e-4)
+    seen = replace(patches, scatter_m=np.hypot(patches.scatter_m, rough_m))
+    every = np.ones(len(seen.scan), dtype=bool)
+    assert roughness_m(seen, every) == pytest.approx([rough_m], rel=0.1, abs=5e-4)
+    assert np.isnan(roughness_m(seen, np.arange(len(every)) < 100)).all()
+
+
+def test_the_ground_is_as_rough_as_the_lidar_says_that_sees_the_least_of_it() -> None:
+    for seeing, expected in ((TRUTH, GRASS_M), (["front"], 0.0), ([], 0.0)):
+        found = ground_roughness_m(on_grass(seeing), TRAJECTORY, TRUTH)
+        assert found == pytest.approx(expected, rel=0.15, abs=2e-3)
+    none = in_yard().part(~level(in_yard(), TRAJECTORY, TRUTH))
+    assert ground_roughness_m(none, TRAJECTORY, TRUTH) is None
+
+
+def test_on_grass_the_height_is_believed_less_and_it_is_said() -> None:
+    used_m, (said,) = prepared(on_grass(TRUTH), vehicle_height=0.3, sigma=0.005)
+    assert used_m == pytest.approx(math.hypot(0.005, LIFT * GRASS_M), rel=0.15)
+    assert "meadow: the ground scatters by" in said
+    assert f"to {1e3 * used_m:.0f} mm in place of ground.sigma (5 mm)" in said
+
+
+@pytest.mark.parametrize(
+    ("seeing", "ground"),
+    [
+        ([], {"vehicle_height": 0.3}),
+        (TRUTH, {}),
+        (TRUTH, {"vehicle_height": 0.3, "use": False}),
+    ],
+    ids=["asphalt", "no height", "no ground"],
+)
+def test_else_nothing_changes(seeing: Collection[str], ground: dict[str, object]) -> None:
+    used_m, said = prepared(on_grass(seeing), sigma=0.004, **ground)
+    assert (used_m, said) == (0.004, ())
+    assert ROUGH_M < GRASS_M

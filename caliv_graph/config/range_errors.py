@@ -53,11 +53,6 @@ BEAM_M = 1e-3
 BEAM_RAD = 5e-5
 """Sigma of the error of elevation and azimuth of one channel, likewise."""
 
-FRAME_RAD, FRAME_M = 2e-5, 1e-4
-"""1 sigma of turn and shift, about and along each axis, of the frame in which a LiDAR sees walls
-and ground of one drive: what no error of its beams above is, such as one that changes around the
-LiDAR, glass, and shapes of the ground."""
-
 CHANNELS_APART_RAD = 0.01
 """Usual angle between two channels: in that distance an error of the beams is another."""
 
@@ -72,7 +67,6 @@ class RangeErrors:
         ground_m: 1 sigma of one more bias on the ground.
         surface_m: 1 sigma of one more bias on a surface, where nothing tells.
         beam_m: 1 sigma of one more bias of the beams at one elevation, where nothing tells.
-        frame_m: 1 sigma of the shift of the frame in which it sees walls and ground.
     """
 
     offset_m: float | None = None
@@ -80,7 +74,6 @@ class RangeErrors:
     ground_m: float = GROUND_M
     surface_m: float = SURFACE_M
     beam_m: float = BEAM_M
-    frame_m: float = FRAME_M
 
     @property
     def beams(self) -> tuple[float, ...]:
@@ -92,11 +85,6 @@ class RangeErrors:
         return self.beam_m, BEAM_RAD, BEAM_RAD, *change
 
     @property
-    def frame(self) -> Array:
-        """(6,) 1 sigma of turn (rad) and shift (m) of the frame of walls and ground."""
-        return np.repeat([FRAME_RAD * self.frame_m / FRAME_M, self.frame_m], 3)
-
-    @property
     def offsets(self) -> SizePrior:
         """The prior of the offsets' sigma."""
         return offset_prior(self.offset_m)
@@ -106,7 +94,7 @@ def range_errors(noise: NoiseConfig) -> RangeErrors:
     """The sizes that a config states; who knows all ranges knows those at a slant, too."""
     stated_m = noise.lidar_range_bias_m
     most_m = math.inf if stated_m is None else stated_m
-    usual = (INCIDENCE_M, GROUND_M, SURFACE_M, BEAM_M, FRAME_M)
+    usual = (INCIDENCE_M, GROUND_M, SURFACE_M, BEAM_M)
     return RangeErrors(stated_m, *(min(usual_m, most_m) for usual_m in usual))
 
 

@@ -21,6 +21,7 @@ from caliv_graph.products import Array, IntArray, Strip, StructureTerm
 from caliv_graph.structure.align import align_patches
 from caliv_graph.structure.beams import CHANNEL_KINDS, beam_nodes, parts_of
 from caliv_graph.structure.elimination import factor_of, half_solved
+from caliv_graph.structure.layout import Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import Problem, relative_motions
@@ -231,6 +232,20 @@ def standing_of(config: Config, heave_m: float) -> Standing:
     )
 
 
+FRAME_PART = 1.0 / 60.0
+"""Part of the tilt of strips from scan to scan that is alike in all of them, 1 sigma: what dents,
+footprints, and beams that err otherwise than by channels do is not independent 3600 times over."""
+
+FRAME_ARM_M = 5.0
+"""Range at which a turn of the frame moves a surface by as much as its shift does."""
+
+
+def frame_sigmas(nuisances: Nuisances) -> Array:
+    """(6,) 1 sigma of turn (rad) and shift (m) of the frame in which a LiDAR sees all strips."""
+    turn_rad = FRAME_PART * float(np.median(nuisances.sighting_tilt))
+    return np.repeat([turn_rad, FRAME_ARM_M * turn_rad], 3)
+
+
 def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     """The quadratic on the poses `kept` (m,), parameters, time offsets and extrinsics.
 
@@ -266,7 +281,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         clocks_apart=found.clocks.apart,
         channels=channel_sizes(found),
     )
-    stated, frame = found.problem.standing, found.problem.range_errors.frame
+    stated, frame = found.problem.standing, frame_sigmas(found.nuisances)
     known, offset = prior.parameter_information, prior.parameter_offset
     b, held = system.b, [system.H]
     del found, system, prior

@@ -53,6 +53,8 @@ def error_effects(
     Raises:
         KeyError: a stamp has no node.
     """
+    if not kinds:
+        return ()
     i = trajectory.node_indices(stamps_ns)
     n, width = len(trajectory.nodes_ns), STATE + AXES * len(kinds)
     common = [] if trajectory.yaw_bias is None else [key_yaw_bias()]

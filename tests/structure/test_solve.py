@@ -10,7 +10,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.config.range_errors import FRAME_M, FRAME_RAD
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, StructureTerm
 from caliv_graph.structure import problem as problems
@@ -26,7 +25,7 @@ from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.solve import Solved, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.system import System, system_of
-from caliv_graph.structure.term import term_of
+from caliv_graph.structure.term import FRAME_ARM_M, FRAME_PART, term_of
 from caliv_graph.structure.thickness import thickness_at_guesses
 from caliv_graph.structure.views import Views
 from tests.structure.yards import (
@@ -227,13 +226,13 @@ def test_the_term_is_the_marginal_on_fewer_poses_too(solved: Solved) -> None:
 
 def test_the_frame_of_walls_and_ground_errs(solved: Solved) -> None:
     """The covariance of extrinsics is larger by that of the frames; the estimate stays."""
-    frame_m = 2e-3
+    tilt_rad = 0.02
     motion = motion_of(solved)
     known: list[Array] = []
     spread: list[Array] = []
-    for own_m, out in ((0.0, known), (frame_m, spread)):
-        errors = replace(solved.problem.range_errors, frame_m=own_m)
-        found = replace(solved, problem=replace(solved.problem, range_errors=errors))
+    for own_rad, out in ((0.0, known), (tilt_rad, spread)):
+        tilts = np.full(len(solved.nuisances.sighting_tilt), own_rad)
+        found = replace(solved, nuisances=replace(solved.nuisances, sighting_tilt=tilts))
         term = term_of(found, np.arange(24))
         H = term.information.copy()
         H[: len(motion), : len(motion)] += motion
@@ -241,8 +240,8 @@ def test_the_frame_of_walls_and_ground_errs(solved: Solved) -> None:
         step = np.asarray(np.linalg.solve(H, term.gradient)[-12:], np.float64)
         out += [information_of(term, motion), step]
 
-    turn_rad = FRAME_RAD * frame_m / FRAME_M
-    frames = np.diag(np.tile(np.repeat([turn_rad, frame_m], 3) ** 2, 2))
+    turn_rad = tilt_rad * FRAME_PART
+    frames = np.diag(np.tile(np.repeat([turn_rad, turn_rad * FRAME_ARM_M], 3) ** 2, 2))
     scale = np.sqrt(np.outer(np.diag(known[0]), np.diag(known[0])))
     expected = np.linalg.solve(np.eye(12) + known[0] @ frames, known[0])
     assert spread[0] / scale == pytest.approx(expected / scale, abs=1e-6)

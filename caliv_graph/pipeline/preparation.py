@@ -130,6 +130,7 @@ def prepare(
     config: Config,
     motions: Mapping[int, MotionData],
     progress: Progress,
+    refused: TargetError | None = None,
 ) -> Prepared:
     """Smooths the trajectories and finds target, ground and structure along them.
 
@@ -138,6 +139,7 @@ def prepare(
         config: topics, noise, target, ground.
         motions: motion data of each drive, by its index.
         progress: reports every stage.
+        refused: why the target that the search would find is not used; None: it is.
 
     Raises:
         CalivError: something is wrong with the input; the message says what to do.
@@ -147,7 +149,9 @@ def prepare(
     recordings, pauses = _with_poses(recordings, config, motions)
     raw = raw_findings(motions, config)
     raise_fatal(raw)
-    rough, findings, search, placements = _searched(recordings, config, motions, raw, progress)
+    rough, findings, search, placements = _searched(
+        recordings, config, motions, raw, progress, refused
+    )
     config, misplaced, observations, no_target, wrong = search
     patches = tuple(
         without_targets(of, observations, rough[of.drive], config)
@@ -220,6 +224,7 @@ def _searched(
     motions: Mapping[int, MotionData],
     raw: tuple[Finding, ...],
     progress: Progress,
+    refused: TargetError | None = None,
 ) -> tuple[Sequence[VehicleTrajectory], tuple[Finding, ...], Search, tuple[Placement, ...]]:
     """The rough trajectories, all findings (`raw` first), the targets, and found mountings.
 
@@ -237,6 +242,8 @@ def _searched(
             rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
         config, placements = place_lidars(recordings, rough, config, progress)
         findings += smoothed_findings(recordings, rough, motions, config, progress)
+        if refused is not None:
+            return rough, findings, (config, (), (), refused, ()), placements
         found = targets_of(recordings, rough, config, progress)
     except (TrajectoryError, TargetError) as error:
         wrong = mistakes(recordings, rough, motions, config, progress, raw)

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.assemble import assemble
-from caliv_graph.calibration.check import check
+from caliv_graph.calibration.check import check, cloud_counts
+from caliv_graph.calibration.choose import SAME_OBJECT_M
 from caliv_graph.calibration.estimate import estimate_with_noise
 from caliv_graph.calibration.requirements import unmet_requirements
 from caliv_graph.calibration.structure_evidence import (
@@ -19,7 +21,7 @@ from caliv_graph.common.memory import collecting_what_is_new
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.guesses import with_found_of
 from caliv_graph.config.model import Config
-from caliv_graph.errors import TargetError
+from caliv_graph.errors import CalivError, TargetError
 from caliv_graph.fusion.marks import drive_marks
 from caliv_graph.fusion.merge import starting_from, with_earlier
 from caliv_graph.fusion.terms import drive_digest
@@ -33,13 +35,16 @@ from caliv_graph.physics import (
 from caliv_graph.pipeline.preparation import Prepared, motions_of, prepare
 from caliv_graph.products import (
     Calibration,
+    MotionData,
     Recording,
 )
 from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
-from caliv_graph.wording.structure import nothing_sentence
+from caliv_graph.uncertainty.consistency import too_many_outliers
+from caliv_graph.wording.contradictions import outliers_text
+from caliv_graph.wording.structure import nothing_sentence, wrong_target_sentence
 
 
 def calibrate(
@@ -70,15 +75,69 @@ def calibrate(
 def _calibrate(
     recordings: Sequence[Recording], config: Config, progress: Progress, prior: Calibration | None
 ) -> CalibrationRun:
-    """One statement per stage; see `calibrate`."""
+    """Once more without the target, if what was found for one is none; see `calibrate`."""
     # The report shows the scans as they are read; nothing is read for it.
-    recordings = sampled = [SampledRecording(recording) for recording in recordings]
-    motions, used, notes = motions_of(recordings, config, progress)
+    sampled = [SampledRecording(recording) for recording in recordings]
+    read = motions_of(sampled, config, progress)
+    run = _calibrated(sampled, config, progress, prior, read)
+    refused = no_target_of(run, config)
+    if refused is None:
+        return run
+    again = [SampledRecording(recording) for recording in recordings]
+    try:
+        alone = _calibrated(again, config, progress, prior, read, refused)
+    except CalivError:
+        return run
+    # A wrong guess or clock contradicts walls, too: then the target shows it as well.
+    return run if alone.calibration.status == "inconsistent" else alone
+
+
+def no_target_of(run: CalibrationRun, config: Config) -> TargetError | None:
+    """Why the object that the search found is no target; None: nothing speaks against it.
+
+    Most clouds of a LiDAR lie elsewhere than the others: on the next object, or along a hedge.
+    """
+    if run.calibration.status != "inconsistent" or config.target is not None:
+        return None
+    if not run.solution.structure or run.record is None:
+        return None
+    for count in cloud_counts(run.solution, run.record.trajectories):
+        off = count.offset_vehicle
+        if (
+            too_many_outliers(count)
+            and 2 * count.outliers >= count.clouds
+            and off is not None
+            and np.linalg.norm(off) > SAME_OBJECT_M
+        ):
+            return TargetError(wrong_target_sentence(outliers_text(count)))
+    return None
+
+
+def _calibrated(
+    sampled: Sequence[SampledRecording],
+    config: Config,
+    progress: Progress,
+    prior: Calibration | None,
+    read: tuple[dict[int, MotionData], Config, tuple[str, ...]],
+    refused: TargetError | None = None,
+) -> CalibrationRun:
+    """One statement per stage.
+
+    Args:
+        sampled: the drives.
+        config: the configuration.
+        progress: reports every stage.
+        prior: see `calibrate`.
+        read: of `motions_of`.
+        refused: why the target that the search finds is not used; None: it is.
+    """
+    recordings: Sequence[Recording] = sampled
+    motions, used, notes = read
     digests = [drive_digest(motion) for motion in motions.values()]
     marks = [drive_marks(motion) for motion in motions.values()]
     guessed = used if prior is None else starting_from(used, prior, digests, marks)
 
-    prepared = prepare(recordings, guessed, motions, progress)
+    prepared = prepare(recordings, guessed, motions, progress, refused)
     try:
         solution, trajectories = estimate_with_noise(
             prepared.observations,

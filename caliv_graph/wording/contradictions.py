@@ -41,7 +41,7 @@ def contradiction_sentence(found: Contradiction, led: bool = False) -> str:
             return _guess(found)
         case CloudCount():
             return (
-                f"{_outliers(found)}; an outlier ratio of {OUTLIERS:.0%} does not explain that "
+                f"{outliers_text(found)}; an outlier ratio of {OUTLIERS:.0%} does not explain that "
                 "many. The result follows the other clouds, which may be the wrong ones"
                 f"{'' if led else ': check its stamps, its mount and the target'}"
             )
@@ -117,7 +117,7 @@ def _guess_remedy(found: GuessContradiction) -> str:
     )
 
 
-def _outliers(count: CloudCount) -> str:
+def outliers_text(count: CloudCount) -> str:
     """How many clouds of a LiDAR are outliers, where in the drive, and how far off."""
     offset = ""
     if count.offset_vehicle is not None:
@@ -153,7 +153,7 @@ def _coarse(found: CoarseRegistrations, led: bool) -> str:
     if led:
         pass
     elif isinstance(found.likely, CloudCount):
-        likely = f" It shows most here: {_outliers(found.likely)}."
+        likely = f" It shows most here: {outliers_text(found.likely)}."
     elif found.likely is not None:
         likely = f" It shows most here: {_score_test(found.likely)}."
     names = " and ".join(f"'{name}'" for name in found.lidars)

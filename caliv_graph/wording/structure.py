@@ -10,6 +10,14 @@ def no_target_sentence(what: str) -> str:
     return f"calibrated without a target, by walls and other structure alone: {what}"
 
 
+def wrong_target_sentence(contradiction: str) -> str:
+    """Why the object that the search found is not used; what its clouds say."""
+    return (
+        f"the object that was found for a target is none: {contradiction}. To use a target, give "
+        "its region (target.min, max)"
+    )
+
+
 def nothing_sentence(what: str, structure: str) -> str:
     """The error where neither target nor structure tells anything; why, of each."""
     return f"{what}. Structure does not replace it: {structure}"

@@ -237,6 +237,10 @@ def shifted(motion: MotionData, north_m: Array) -> MotionData:
     return replace(motion, gnss=replace(motion.gnss, latitude_deg=turned))
 
 
+def test_errors_that_are_stated_already_have_no_effects_to_work_out() -> None:
+    assert error_effects(base(), WANTED.tolist(), []) == ()
+
+
 def test_poses_follow_an_error_of_the_fixes_by_the_gain() -> None:
     motion = recorded()
     assert motion.gnss is not None

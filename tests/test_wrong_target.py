@@ -1,0 +1,90 @@
+"""What the search takes for the target is none: the drive is calibrated without one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import Config
+from caliv_graph.errors import CalivError, SolveError, TargetError
+from caliv_graph.pipeline import run as pipeline
+from caliv_graph.pipeline.run import calibrate
+from caliv_graph.uncertainty.consistency import CloudCount
+
+LIDAR = {"topic": "/a", "initial": {"xyz": [0, 0, 1], "rpy_deg": [0, 0, 0]}}
+
+
+def config_of(**more: object) -> Config:
+    return Config.model_validate({"lidars": {"a": LIDAR}, **more})
+
+
+@dataclass
+class Solves:
+    """Stands in for a run; the first one is inconsistent."""
+
+    second: str | CalivError = "ok"
+    structure: tuple[object, ...] = ("walls",)
+    count: CloudCount = field(
+        default_factory=lambda: CloudCount(
+            "a", 16, 16, (8, 8), (8, 8), (8, 8), (8, 8), np.array([-0.94, 2.38, 0.26])
+        )
+    )
+    refused: list[TargetError | None] = field(default_factory=list)
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.refused.append(arguments[5] if len(arguments) > 5 else None)
+        first = self.refused[-1] is None
+        if not first and isinstance(self.second, CalivError):
+            raise self.second
+        return SimpleNamespace(
+            calibration=SimpleNamespace(status="inconsistent" if first else self.second),
+            solution=SimpleNamespace(structure=self.structure),
+            record=SimpleNamespace(trajectories=()),
+        )
+
+    def status(self, config: Config) -> str:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pipeline, "_calibrated", self)
+            patch.setattr(pipeline, "motions_of", lambda *_: ({}, config, ()))
+            patch.setattr(pipeline, "cloud_counts", lambda *_: (self.count,))
+            return calibrate([], config, SilentProgress()).calibration.status
+
+
+def test_clouds_on_another_object_are_no_end_of_a_calibration_by_walls() -> None:
+    solves = Solves()
+    assert solves.status(config_of()) == "ok"
+    first, second = solves.refused
+    assert first is None
+    assert "found for a target is none: lidar 'a': 16 of its 16 target clouds" in str(second)
+    assert "median offset 2.57 m" in str(second)
+
+
+@pytest.mark.parametrize("second", ["inconsistent", SolveError("nothing to solve")])
+def test_what_contradicts_walls_too_is_said_as_before(second: str | CalivError) -> None:
+    solves = Solves(second)
+    assert solves.status(config_of()) == "inconsistent"
+    assert len(solves.refused) == 2
+
+
+def counted(outliers: int, offset_m: float) -> CloudCount:
+    return CloudCount("a", 16, outliers, (8, 4), (8, 4), (8, 4), (8, 4), np.array([offset_m, 0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("solves", "config"),
+    [
+        (Solves(), config_of(target=[{"min": [0, 0, 0], "max": [1, 1, 1]}])),
+        (Solves(structure=()), config_of()),
+        (Solves(count=counted(16, 0.1)), config_of()),
+        (Solves(count=counted(6, 2.0)), config_of()),
+    ],
+    ids=["a region is given", "no walls", "the same object", "a few clouds"],
+)
+def test_else_a_contradiction_is_one(solves: Solves, config: Config) -> None:
+    assert solves.status(config) == "inconsistent"
+    assert solves.refused == [None]

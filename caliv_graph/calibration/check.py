@@ -103,6 +103,7 @@ def check(
                     heading.sigma_rad,
                     told_apart=heading.measured or math.isfinite(heading.axle_m),
                     measured=heading.measured,
+                    oriented=heading.oriented,
                 )
                 for index, heading in headings.items()
             ],

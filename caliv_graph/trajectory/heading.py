@@ -53,6 +53,7 @@ class HeadingDisagreement:
             curves do not determine it.
         duration_s: of driving that was compared.
         measured: whether the lateral velocity was measured (twist), not assumed to be zero.
+        oriented: whether an orientation source tells the heading; else fixes and gyroscope do.
         warning: a line for the user; empty without a significant disagreement.
     """
 
@@ -61,6 +62,7 @@ class HeadingDisagreement:
     axle_m: float
     duration_s: float
     measured: bool
+    oriented: bool
     warning: str
 
 
@@ -91,6 +93,7 @@ def heading_disagreement(
             axle_m=math.nan,
             duration_s=duration_s,
             measured=measured is not None,
+            oriented=smoothed.data.orientation,
             warning=(
                 f"{motion.name}: heading is turned by {math.degrees(map_turn):+.0f} degrees "
                 "against the path of the GNSS fixes, which hardly count therefore. Check that the "
@@ -114,11 +117,12 @@ def heading_disagreement(
     yaw = coarse + float(solution[0])
     warning = ""
     if abs(yaw) > max(SIGMAS * sigma, FLOOR_RAD):
+        or_bias = ", or set imu.yaw_bias" if smoothed.data.orientation else ""
         warning = (
             f"{motion.name}: heading is turned by {math.degrees(yaw):+.2f} degrees "
             f"(sigma {math.degrees(sigma):.2f}) against the direction in which the vehicle goes: "
-            "yaw of every LiDAR to the vehicle is off by as much. Check imu.T_vehicle_imu, or set "
-            f"imu.yaw_bias{_or_axle(yaw, forward, turn, separable or measured is not None)}"
+            "yaw of every LiDAR to the vehicle is off by as much. Check imu.T_vehicle_imu"
+            f"{or_bias}{_or_axle(yaw, forward, turn, separable or measured is not None)}"
         )
     return HeadingDisagreement(
         yaw_rad=yaw,
@@ -126,6 +130,7 @@ def heading_disagreement(
         axle_m=float(solution[1]) if separable else math.nan,
         duration_s=duration_s,
         measured=measured is not None,
+        oriented=smoothed.data.orientation,
         warning=warning,
     )
 

@@ -157,7 +157,7 @@ class Assumed:
 
 @dataclass(frozen=True)
 class Heading:
-    """Orientation source against direction of travel, of one drive.
+    """Heading against direction of travel, of one drive.
 
     Attributes:
         drive: its name.
@@ -165,6 +165,8 @@ class Heading:
         sigma_rad: of it.
         told_apart: whether the drive separates it from a vehicle frame that is off the rear axle.
         measured: whether lateral velocity was measured: it then contains what the axle does.
+        oriented: whether an orientation source tells the heading; else fixes and gyroscope tell
+            that of the IMU, and `imu.T_vehicle_imu` that of the vehicle.
     """
 
     drive: str
@@ -172,6 +174,7 @@ class Heading:
     sigma_rad: float
     told_apart: bool
     measured: bool = False
+    oriented: bool = True
 
     @property
     def sigma_with_allowance_rad(self) -> float:

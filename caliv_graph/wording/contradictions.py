@@ -235,10 +235,13 @@ def _assumed(found: Assumed) -> str:
 
 
 def _heading(found: Heading) -> str:
-    sigma = found.sigma_with_allowance_rad
+    sigma, off_deg = found.sigma_with_allowance_rad, math.degrees(found.yaw_rad)
+    source = "the orientation source and" if found.oriented else "the yaw of imu.T_vehicle_imu and"
+    remedy = "Check imu.T_vehicle_imu, or set imu.yaw_bias"
+    if not found.oriented:
+        remedy = f"Check imu.T_vehicle_imu: {off_deg:+.1f} degrees more of yaw would fit"
     return (
-        f"{found.drive}: the orientation source and the direction of travel contradict each other "
-        f"by {math.degrees(found.yaw_rad):+.2f} +- {math.degrees(sigma):.2f} degrees "
-        f"({abs(found.yaw_rad) / sigma:.0f} sigma): the S2V yaw of every LiDAR has the same error. "
-        "Check imu.T_vehicle_imu, or set imu.yaw_bias"
+        f"{found.drive}: {source} the direction of travel contradict each other by {off_deg:+.2f} "
+        f"+- {math.degrees(sigma):.2f} degrees ({abs(found.yaw_rad) / sigma:.0f} sigma): the S2V "
+        f"yaw of every LiDAR has the same error. {remedy}"
     )

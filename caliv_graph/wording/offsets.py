@@ -12,16 +12,36 @@ LATE_SIGMAS, LATE_S = 4.0, 2e-3
 merges sensors, and of the noise of a sound drive one in 16,000 is 4 sigmas."""
 
 
+_LOOKS_THE_SAME = {
+    "gnss_time_offset": "gnss.lever_arm",
+    "imu_time_offset": "imu.T_vehicle_imu",
+    "twist_time_offset": "wheels.T_vehicle_wheels",
+    "pose_time_offset": "the frame of the poses",
+}
+"""What else moves the same measurements along the course while the speed hardly changes."""
+
+
 def late_clock_sentences(vehicle: Mapping[str, VehicleParameter]) -> Iterator[str]:
-    """A sentence per sensor of the motion whose clock is off, by name of `VehicleParameter`."""
+    """A sentence per sensor of the motion whose clock is off, by name of `VehicleParameter`.
+
+    An offset that the drive does not determine may as well be an error of the arm.
+    """
     for name in (name for name in TIME_OFFSETS if name in vehicle):
         value_s, sigma_s = float(vehicle[name].value[0]), float(vehicle[name].sigma[0])
-        if abs(value_s) > max(LATE_SIGMAS * sigma_s, LATE_S):
-            way = "late" if value_s > 0.0 else "early"
+        if abs(value_s) <= max(LATE_SIGMAS * sigma_s, LATE_S):
+            continue
+        size = f"{1e3 * abs(value_s):.1f} +- {1e3 * sigma_s:.1f} ms"
+        way, key = "late" if value_s > 0.0 else "early", PARAMETER_KEYS[name]
+        if vehicle[name].determined[0]:
             yield (
-                f"{PARAMETER_KEYS[name]}: the stamps are {1e3 * abs(value_s):.1f} +- "
-                f"{1e3 * sigma_s:.1f} ms {way} against the other sensors. The extrinsics count "
-                "that; whatever else merges these sensors has to: correct the clock"
+                f"{key}: the stamps are {size} {way} against the other sensors. The extrinsics "
+                "count that; whatever else merges these sensors has to: correct the clock"
+            )
+        else:
+            yield (
+                f"{key}: the stamps seem {size} {way} against the other sensors, or "
+                f"{_LOOKS_THE_SAME[name]} is wrong: this drive hardly tells them apart, and the "
+                "extrinsics count either. Measure the arm again, and check the clock"
             )
 
 

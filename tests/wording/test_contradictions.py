@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -157,6 +158,14 @@ def test_a_heading_comes_with_its_angle_and_the_allowance() -> None:
     assert "contradict each other by +1.00 +- 0.12 degrees (9 sigma)" in text
     measured = Heading("drive", degree, 3e-3, told_apart=True, measured=True)
     assert "+1.00 +- 0.17 degrees" in contradiction_sentence(measured)
+
+
+def test_without_an_orientation_source_the_mounting_of_the_imu_is_what_tells_the_heading() -> None:
+    found = Heading("drive", math.radians(-3.0), 1e-3, told_apart=True, oriented=False)
+    text = contradiction_sentence(found)
+    assert "the yaw of imu.T_vehicle_imu and the direction of travel" in text
+    assert text.endswith("Check imu.T_vehicle_imu: -3.0 degrees more of yaw would fit")
+    assert "yaw_bias" in contradiction_sentence(replace(found, oriented=True))
 
 
 def test_ranges_that_disagree_give_no_advice_after_a_suspect() -> None:

@@ -16,6 +16,13 @@ def test_an_offset_is_undetermined_from_the_limit_on() -> None:
     ]
 
 
+def test_a_clock_that_the_drive_does_not_determine_may_be_an_arm() -> None:
+    found = {"gnss_time_offset": VehicleParameter(np.array([0.04]), np.array([0.009]), (False,))}
+    (text,) = late_clock_sentences(found)
+    assert text.startswith("gnss.time_offset: the stamps seem 40.0 +- 9.0 ms late")
+    assert "or gnss.lever_arm is wrong" in text
+
+
 def test_a_clock_is_late_beyond_its_sigma_and_beyond_what_matters() -> None:
     def clock(value_s: float, sigma_s: float) -> VehicleParameter:
         return VehicleParameter(np.array([value_s]), np.array([sigma_s]), (True,))

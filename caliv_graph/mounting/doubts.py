@@ -25,7 +25,7 @@ from caliv_graph.products import Array, Recording
 from caliv_graph.targets.search.find import scans_to_read
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 
-Kind = Literal["exchanged", "turned", "heading", "mirrored", "left_handed"]
+Kind = Literal["exchanged", "turned", "upside_down", "heading", "mirrored", "left_handed"]
 
 SHARPER = 1.6
 """Times as many points at one place from which a mistake is said. Measured on an arc and an S-curve
@@ -34,6 +34,9 @@ past a chair and a few other objects: 2.3 to 15 for what was wrong, 1.3 at most 
 ALIKE = 0.9
 """Explanations that sharpen the maps nearly as much: then the one whose guesses are nearer holds.
 On an arc a mounting may turn about the centre of the arc."""
+
+UPSIDE_DOWN = math.cos(math.radians(135.0))
+"""Cosine of the angle between up by the guess and up by the ground, from which a LiDAR hangs."""
 
 QUARTERS = (180, 90, -90)
 """Turns that are tried, degrees: axes that were taken for others."""
@@ -47,12 +50,13 @@ class Doubt:
         drive: index of the drive that shows it.
         name: of its recording.
         kind: `exchanged`: two LiDARs have each other's guess. `turned`: the guess of one is.
+            `upside_down`: the same about an axis of the LiDAR that lies in its horizon.
             `heading`: that of the vehicle is, against its path. `mirrored`: the path turns right
             where the vehicle turned left, or all clouds are left-handed, which looks the same.
             `left_handed`: the clouds have x forward, y to the right and z up.
         lidars: whose maps become sharper.
         turn_deg: of `turned` and `heading`: of the guess or the heading against the right one,
-            counted to the left.
+            counted to the left. Of `upside_down`: 0 about x (roll), 90 about y (pitch).
         sharing: points that share a cell (`sharpness.sharpest_near`), now and without the mistake,
             of each of `lidars`.
         given: whether poses were given.
@@ -108,7 +112,7 @@ def doubts(
         views = _views(recording, trajectory, config, names, progress)
         doubt = _of_drive(drive, recording.name, views, config, given)
         if doubt is not None:
-            of = () if doubt.kind in ("exchanged", "turned") else (drive,)
+            of = () if doubt.kind in ("exchanged", "turned", "upside_down") else (drive,)
             found.setdefault((doubt.kind, doubt.lidars, *of), doubt)
     return tuple(found.values())
 
@@ -137,6 +141,9 @@ def _of_drive(
 ) -> Doubt | None:
     """The mistake whose undoing sharpens the maps most; None if none does by much."""
     guesses = {n: config.lidars[n].guess() for n in views}
+    for n, T in guesses.items():
+        if np.asarray(T.rotation().matrix())[2] @ views[n].ground.up_lidar < UPSIDE_DOWN:
+            return _upside_down(drive, name, n, views[n], T, given)
     now = {n: _sharpness(views[n], T)[0] for n, T in guesses.items()}
     best: tuple[float, float, _Trial, dict[str, float]] | None = None
     for trial in _trials(guesses, given):
@@ -156,6 +163,23 @@ def _of_drive(
     _, _, trial, then = best
     sharing = {n: (now[n], then[n]) for n in then}
     return Doubt(drive, name, trial.kind, tuple(then), trial.turn_deg, sharing, given)
+
+
+def _upside_down(
+    drive: int, name: str, lidar: str, view: View, guess: gtsam.Pose3, given: bool
+) -> Doubt:
+    """Which way it is turned over: maps are drawn in level axes, and only yaw makes them sharp."""
+    now, _ = _sharpness(view, guess)
+    sharp = {turn: _sharpness(view, turned_over(guess, turn))[0] for turn in (0, 90)}
+    turn = max(sharp, key=sharp.__getitem__)
+    return Doubt(drive, name, "upside_down", (lidar,), turn, {lidar: (now, sharp[turn])}, given)
+
+
+def turned_over(T_vehicle_lidar: gtsam.Pose3, turn_deg: int) -> gtsam.Pose3:
+    """A mounting the other way up: about x of the LiDAR (0) or about its y (90)."""
+    about = gtsam.Rot3.Rx(math.pi) if turn_deg == 0 else gtsam.Rot3.Ry(math.pi)
+    rotation = T_vehicle_lidar.rotation().compose(about)
+    return gtsam.Pose3(rotation, T_vehicle_lidar.translation())
 
 
 def _explains(gains: Array, kind: Kind) -> bool:

@@ -32,6 +32,7 @@ from caliv_graph.physics import (
     ranked_with,
     warnings_of,
 )
+from caliv_graph.pipeline.mistakes import mistakes
 from caliv_graph.pipeline.preparation import Prepared, motions_of, prepare
 from caliv_graph.products import (
     Calibration,
@@ -44,6 +45,7 @@ from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
 from caliv_graph.uncertainty.consistency import too_many_outliers
 from caliv_graph.wording.contradictions import outliers_text
+from caliv_graph.wording.mounting import mistake_sentence
 from caliv_graph.wording.structure import nothing_sentence, wrong_target_sentence
 
 
@@ -170,12 +172,18 @@ def _calibrated(
         names = [recording.name for recording in recordings]
         clocks = clock_findings(names, solution.structure, calibration)
         findings = (*prepared.findings, *clocks)
-        if prepared.mistakes:
+        said = prepared.mistakes
+        if not said and _blames_a_guess(calibration):
+            with_any = mistakes(
+                recordings, prepared.trajectories, motions, guessed, progress, prepared.findings
+            )
+            said = tuple(mistake_sentence(doubt, guessed) for doubt in with_any)
+        if said:
             # What a solve from a mistaken guess or heading contradicts has that cause.
             calibration = replace(calibration, contradictions=())
         calibration = contradicted(
             ranked_with(calibration, findings),
-            (*prepared.mistakes, *prepared.contradictions),
+            (*said, *prepared.contradictions),
             contradictions_of(findings),
         )
         calibration, conflicts = with_prior(calibration, prior, config)
@@ -191,6 +199,14 @@ def _calibrated(
     )
     calibration = replace(calibration, warnings=tuple(dict.fromkeys(warnings)))
     return CalibrationRun(calibration, solution, prepared.observations, record)
+
+
+def _blames_a_guess(calibration: Calibration) -> bool:
+    """Whether something is wrong, and no input of the motion explains it best."""
+    first = calibration.suspects[:1]
+    return calibration.status == "inconsistent" and all(
+        suspect.input.startswith("lidars.") for suspect in first
+    )
 
 
 def structure_evidence(prepared: Prepared) -> StructureEvidence:

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.model import Config
-from caliv_graph.mounting.doubts import Doubt
+from caliv_graph.mounting.doubts import Doubt, turned_over
 from caliv_graph.mounting.place import Placement
 from caliv_graph.mounting.sharpness import CELLS_M
 
@@ -48,6 +48,8 @@ def region_sentence(placements: Sequence[Placement]) -> str:
 
 def mistake_sentence(found: Doubt, config: Config) -> str:
     """A mistake that explains what the LiDARs see: which, the numbers, and what to correct."""
+    if found.kind == "upside_down":
+        return f"{found.name}: most likely, {_upside_down(found, config)}"
     what, undone, remedy = _mistake(found, config)
     cell_m = CELLS_M[-1]
     sharing = ", ".join(
@@ -57,6 +59,18 @@ def mistake_sentence(found: Doubt, config: Config) -> str:
     return (
         f"{found.name}: most likely, {what}. {undone}, what stands still is seen at one place: "
         f"{sharing}. {remedy}"
+    )
+
+
+def _upside_down(found: Doubt, config: Config) -> str:
+    """Which LiDAR hangs, or stands, and its guess the right way up."""
+    (name,) = found.lidars
+    over = turned_over(config.lidars[name].guess(), found.turn_deg)
+    listed = ", ".join(f"{angle:.1f}" for angle in np.degrees(over.rotation().rpy()) + 0.0)
+    axis = "roll" if found.turn_deg == 0 else "pitch"
+    return (
+        f"the initial guess has lidar '{name}' upside down: the ground that it sees would be above "
+        f"it ({axis} about 180 degrees off). Set lidars.{name}.initial.rpy_deg to about [{listed}]"
     )
 
 

@@ -76,6 +76,20 @@ def test_a_guess_whose_yaw_is_a_quarter_turn_off(degrees: float) -> None:
     assert f"{math.remainder(right, 360.0):.1f}]" in text
 
 
+@pytest.mark.parametrize(("axis", "word"), [("x", "roll"), ("y", "pitch")])
+def test_a_lidar_that_is_the_other_way_up(axis: str, word: str) -> None:
+    over = gtsam.Rot3.Rx(math.pi) if axis == "x" else gtsam.Rot3.Ry(math.pi)
+    guess = REAR.compose(ERROR).compose(gtsam.Pose3(over, np.zeros(3)))
+    config = config_of(front=FRONT.compose(ERROR), rear=guess)
+    (doubt,) = found(config)
+    assert (doubt.kind, doubt.lidars) == ("upside_down", ("rear",))
+    text = mistake_sentence(doubt, config)
+    assert "the initial guess has lidar 'rear' upside down" in text
+    assert f"({word} about 180 degrees off)" in text
+    right = np.degrees(REAR.compose(ERROR).rotation().rpy())
+    assert f"about [{', '.join(f'{angle:.1f}' for angle in right)}]" in text
+
+
 def test_a_heading_that_points_backwards() -> None:
     back = gtsam.Pose3(gtsam.Rot3.Yaw(math.pi), np.zeros(3))
     way = along(*(T.compose(back) for T in DRIVE.way.trajectory.T_map_vehicle))

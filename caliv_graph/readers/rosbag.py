@@ -33,7 +33,13 @@ from caliv_graph.readers.pointcloud2 import (
 )
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses
 from caliv_graph.readers.stamps import StampMark
-from caliv_graph.readers.sweeps import TimesSeen, decode_cloud, times_warnings, with_mark
+from caliv_graph.readers.sweeps import (
+    TimesSeen,
+    decode_cloud,
+    times_warnings,
+    untimed_warning,
+    with_mark,
+)
 
 _KINDS = {
     "imu": "IMU",
@@ -343,7 +349,8 @@ class RosbagRecording:
                 period_s = self._index.clocks[self._topics[lidar].name].period_s
                 where = f"{self._bag.name}: LiDAR '{lidar}'"
                 lines += times_warnings(where, times, self._index.marks[lidar], period_s)
-        return lines
+        read = {lidar: times for lidar, times in self._times.items() if self._looked_at[lidar]}
+        return lines + untimed_warning(self._bag.name, read)
 
 
 def _seconds(stamp_ns: int) -> str:

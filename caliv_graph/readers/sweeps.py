@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -234,6 +234,20 @@ def times_warnings(
     if mark.note:
         lines.append(f"{where}: {mark.note}")
     return lines
+
+
+def untimed_warning(where: str, seen: Mapping[str, TimesSeen]) -> list[str]:
+    """A line if some LiDARs of a recording, of those that were read, have times and others not."""
+    timed = [f"'{name}'" for name, times in seen.items() if times.field and times.span_s > 0.0]
+    without = [f"'{name}'" for name, times in seen.items() if times.field is None]
+    if not timed or not without:
+        return []
+    return [
+        f"{where}: points of {' and '.join(without)} have no times, those of {' and '.join(timed)} "
+        "have. All points of a cloud without times are taken at its stamp: unless it is motion-"
+        "compensated to that, or taken at once, walls and clocks contradict those of the others. "
+        "Let the driver write the time of every point"
+    ]
 
 
 def _least_span_s(period_s: float) -> float:

@@ -79,6 +79,8 @@ class SmootherInput:
         second_arm: (3,) the second antenna in the vehicle frame, metres.
         late_ns: sensor (`IMU_CLOCK`, `GNSS_CLOCK`) -> stamps less true times in the clock of the
             LiDARs; absent: 0. Stamps of `inertial` are free of it, all others as they were read.
+        slow_orientation_rad: 1 sigma of errors of the orientations at a node beside their noise,
+            which hardly change from node to node.
     """
 
     name: str
@@ -104,6 +106,7 @@ class SmootherInput:
     heading_yaw: float = 0.0
     second_arm: Array = field(default_factory=lambda: np.zeros(3))
     late_ns: Mapping[str, int] = field(default_factory=dict)
+    slow_orientation_rad: float = 0.0
 
     @property
     def heading_imu(self) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -88,6 +88,9 @@ def carry_to_nodes(
         orientations = orientations_at_nodes(
             data.motion.imu, cov, nodes, dead, data.noise, imu_late
         )
+        if orientations is not None and data.slow_orientation_rad:
+            slow = data.slow_orientation_rad**2 * np.eye(3)
+            orientations = replace(orientations, cov=orientations.cov + slow)
     if data.motion.twist is not None and "velocity" in kinds:
         velocities = velocities_at_nodes(
             data.motion.twist,

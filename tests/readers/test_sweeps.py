@@ -12,7 +12,7 @@ from caliv_graph.config.model import TopicsConfig
 from caliv_graph.readers.cloud_folder import CloudFolder
 from caliv_graph.readers.pointcloud2 import DecodedCloud, TimeField
 from caliv_graph.readers.rosbag import RosbagRecording
-from caliv_graph.readers.sweeps import mark_of_clouds
+from caliv_graph.readers.sweeps import TimesSeen, mark_of_clouds, untimed_warning
 from tests.readers.bags import SECOND, START, cloud, write_bag
 
 COUNT = 50
@@ -159,3 +159,16 @@ def test_clouds_in_files(tmp_path: Path) -> None:
     assert all(scan.point_times_s is None for scan in recording.scans("top"))
     (line,) = [line for line in recording.warnings() if "LiDAR 'top'" in line]
     assert "are not used: field 'time' (float32)" in line
+
+
+def test_a_lidar_without_times_beside_one_that_has_them_is_named() -> None:
+    timed = TimesSeen(TimeField("t", "float32", "seconds"), 0.0, 0.1, 20, span_s=0.1)
+    flash, none = TimesSeen(timed.field, clouds=20), TimesSeen()
+    (line,) = untimed_warning("bag", {"top": timed, "left": none, "right": none})
+    assert line.startswith("bag: points of 'left' and 'right' have no times, those of 'top' have.")
+    for of in (
+        {"top": timed, "left": flash},
+        {"top": none, "left": none},
+        {"top": flash, "a": none},
+    ):
+        assert untimed_warning("bag", of) == []

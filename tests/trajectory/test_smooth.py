@@ -408,6 +408,26 @@ def test_fixes_that_jump_are_dropped(kernel: str) -> None:
     assert "GNSS fixes disagree with the motion, dropped" in smoothed.warnings[-1]
 
 
+def tilting(motion: MotionData, tilt_rad: float) -> MotionData:
+    """Orientations whose vertical goes around in half a minute."""
+    imu = motion.imu
+    assert imu is not None
+    phase = 2.0 * math.pi * seconds(imu.stamps_ns) / 30.0
+    off = tilt_rad * np.column_stack([np.sin(phase), np.cos(phase), np.zeros(len(phase))])
+    turned = Rotation.from_rotvec(off) * Rotation.from_quat(np.asarray(imu.orientation_xyzw))
+    return replace(motion, imu=replace(imu, orientation_xyzw=np.asarray(turned.as_quat())))
+
+
+def test_sound_fixes_stay_beside_orientations_that_err_slowly() -> None:
+    """A third of them were dropped: 200 orientations a second were believed to their noise."""
+    sensors = replace(AWKWARD, gnss_hz=1.0, imu_hz=200.0)
+    motion = replace(tilting(record(ROUGH, sensors, 4), 5e-3), twist=None)
+    config = config_for(AWKWARD, noise={"orientation_deg": 0.0573})
+    smoothed = smooth_trajectory(motion, config, stamps(ROUGH.duration_s, 5.0, 0.0512))
+    assert not len(smoothed.gnss_rejected)
+    assert not any("GNSS" in warning for warning in smoothed.warnings)
+
+
 def test_without_a_kernel_a_jump_is_believed() -> None:
     motion = shifted(record(ROUGH, AWKWARD, 3), 12.0, 16.0, 3.0)
     config = config_for(AWKWARD, robust={"kernel": "none"})

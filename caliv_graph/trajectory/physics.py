@@ -117,6 +117,7 @@ class MotionPhysics:
         speed: of the velocities over that of the GNSS.
         axes: of the accelerometer.
         heading: of two antennas against the course.
+        oriented: whether the IMU's messages carry orientations.
     """
 
     name: str
@@ -126,6 +127,7 @@ class MotionPhysics:
     axes: Axes | None = None
     yaw_rate: Ratio | None = None
     heading: Misheading | None = None
+    oriented: bool = False
 
 
 def known_rotation(config: Config) -> Array | None:
@@ -144,7 +146,7 @@ def motion_physics(motion: MotionData, config: Config) -> MotionPhysics | None:
     if motion.imu is None:
         return None if motion.twist is None else _wheel_physics(motion, motion.twist, config)
     inertial, _ = clean_inertial(motion.imu, motion.name)
-    has_orientation(motion.imu, inertial, motion.name)
+    oriented = has_orientation(motion.imu, inertial, motion.name)
     mean = inertial.force.mean(axis=0)
     up_imu = mean / np.linalg.norm(mean)
     R_vehicle_imu = known_rotation(config)
@@ -166,7 +168,9 @@ def motion_physics(motion: MotionData, config: Config) -> MotionPhysics | None:
     speed = _speed(motion, moving)
     axes = accelerometer_axes(moving, inertial, motion, R_vehicle_imu, config)
     heading = _heading_by_course(motion, moving, config)
-    return MotionPhysics(motion.name, gravity, tuple(ratios), speed, axes, heading=heading)
+    return MotionPhysics(
+        motion.name, gravity, tuple(ratios), speed, axes, heading=heading, oriented=oriented
+    )
 
 
 def _wheel_physics(motion: MotionData, twist: TwistSamples, config: Config) -> MotionPhysics | None:

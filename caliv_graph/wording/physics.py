@@ -44,6 +44,9 @@ are below."""
 MIN_TILT_RAD = math.radians(1.0)
 """A smaller tilt of the vehicle's axes is not said: load and springs do as much."""
 
+TURNED_RAD, REVERSED_RAD = math.radians(60.0), math.radians(135.0)
+"""Yaw of the IMU's axes from which they are others, and from which they point backwards."""
+
 MIN_YAW_RAD = math.radians(20.0)
 """A smaller angle between axes and path is left to the heading of the smoothed trajectory, which
 knows it better: a wrong lever arm turns the path of an antenna by some degrees."""
@@ -76,7 +79,8 @@ def motion_findings(found: MotionPhysics, config: Config) -> tuple[Finding, ...]
         return (_gravity(found, config), *_rates(found))
     out = [*_rates(found), *heading]
     if axes is not None:
-        out += _axes(found.name, axes, config)
+        told = found.oriented or found.heading is not None
+        out += _axes(found.name, axes, config, told)
     return tuple(out)
 
 
@@ -234,8 +238,12 @@ def _turn(degrees: float) -> float:
     return math.remainder(degrees, 360.0) + 0.0
 
 
-def _axes(name: str, axes: Axes, config: Config) -> Iterator[Finding]:
-    """The accelerometer's horizontal axes against the path of the GNSS antenna."""
+def _axes(name: str, axes: Axes, config: Config, told: bool) -> Iterator[Finding]:
+    """The accelerometer's horizontal axes against the path of the GNSS antenna.
+
+    `told`: something else tells the heading. Nothing can be smoothed with an IMU that is turned by
+    a quarter turn and more, if it is all that does.
+    """
     if axes.mirrored:
         yield Finding(
             "topics.imu",
@@ -251,15 +259,22 @@ def _axes(name: str, axes: Axes, config: Config) -> Iterator[Finding]:
     R = known_rotation(config)
     if R is not None and abs(axes.yaw_rad) > MIN_YAW_RAD and sigmas > CONTRADICTION_SIGMAS:
         value = _degrees(gtsam.Rot3.Rz(axes.yaw_rad).matrix() @ R)
+        unless = ""
+        if abs(axes.yaw_rad) > REVERSED_RAD:
+            unless = (
+                ", unless the velocities in topics.twist have the wrong sign"
+                if config.topics.twist is not None
+                else ", unless the vehicle reverses all the way"
+            )
         yield Finding(
             "imu.T_vehicle_imu",
             value,
             math.degrees(axes.sigma_rad),
             sigmas,
-            "contradiction",
+            "contradiction" if told or abs(axes.yaw_rad) < TURNED_RAD else "fatal",
             f"{name}: the IMU's axes are turned by {math.degrees(axes.yaw_rad):+.0f} +- "
             f"{math.degrees(axes.sigma_rad):.0f} degrees of yaw against the accelerations of the "
-            f"path: imu.T_vehicle_imu rpy_deg about {_rpy(value)} would fit",
+            f"path: imu.T_vehicle_imu rpy_deg about {_rpy(value)} would fit{unless}",
         )
     if axes.delay_s is not None:
         delay_s, sigma_s = axes.delay_s

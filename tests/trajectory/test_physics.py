@@ -145,6 +145,25 @@ def test_a_quarter_turn_of_yaw_is_named_and_corrected(course: Course) -> None:
         assert abs(turned[0].value[2]) < max(5.0 * turned[0].sigma, 5.0)
 
 
+@pytest.mark.parametrize(
+    ("yaw_deg", "unless"), [(90.0, ""), (180.0, "unless the velocities in topics.twist")]
+)
+def test_without_orientations_axes_that_are_turned_leave_nothing_to_smooth(
+    yaw_deg: float, unless: str
+) -> None:
+    """The smoother took minutes for a path that fixes and accelerations do not share."""
+    motion = recorded(EIGHT, 0)
+    assert motion.imu is not None
+    blind = replace(motion, imu=replace(motion.imu, orientation_xyzw=None))
+    for of, severity in ((motion, "contradiction"), (blind, "fatal")):
+        found = found_in(of, imu=mounted(0.0, 0.0, yaw_deg))
+        (turned,) = (f for f in found if f.input == "imu.T_vehicle_imu")
+        assert turned.severity == severity
+        assert unless in turned.sentence
+    (small,) = found_in(blind, imu=mounted(0.0, 0.0, 40.0))
+    assert small.severity == "contradiction"
+
+
 @pytest.mark.parametrize("late_s", [0.3, -0.2])
 def test_a_late_gnss_clock_is_named_in_its_own_seconds(late_s: float) -> None:
     for seed in SEEDS:

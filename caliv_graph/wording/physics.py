@@ -443,6 +443,17 @@ def _height(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], flo
         f"fit together (chi2 {misfit.chi2:.1f} of {misfit.dof}): "
     )
     fits = f"would fit ({misfit.sigmas:.1f} sigma)"
+    if _fit_inversely(misfit, config):
+        first = misfit.lidar or next(iter(config.lidars))
+        value = float(config.lidars[first].guess().inverse().z())
+        whose = (
+            f"the inverse of that of lidar '{first}' fits" if misfit.lidar else "all inverses fit"
+        )
+        text += (
+            f"{whose}. Enter where a LiDAR is in the vehicle frame (T_vehicle_lidar), not where the "
+            "vehicle is in its own"
+        )
+        return f"lidars.{first}.initial.xyz", (value,), misfit.sigma, text
     if misfit.lidar:
         key = f"lidars.{misfit.lidar}.initial.xyz"
         value = float(config.lidars[misfit.lidar].guess().z()) + misfit.value
@@ -454,6 +465,22 @@ def _height(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], flo
         if misfit.dof == 1:
             text += f", or z of lidar '{next(iter(config.lidars))}' is wrong"
     return key, (value,), misfit.sigma, text
+
+
+INVERSE_M = 0.3
+"""Largest z of a guess's inverse off the height that the ground asks for: tilts of both guesses."""
+
+
+def _fit_inversely(misfit: Misfit, config: Config) -> bool:
+    """Whether the ground lies where the inverses of the guesses have it that are off."""
+    names = [misfit.lidar] if misfit.lidar else list(config.lidars)
+    if any(config.lidars[name].initial is None for name in names):
+        return False
+    guesses = [config.lidars[name].guess() for name in names]
+    now = np.array([T.z() for T in guesses])
+    inverse = np.array([T.inverse().z() for T in guesses])
+    fits = np.abs(inverse - now - misfit.value) < INVERSE_M
+    return bool(fits.all() and abs(misfit.value) > 2.0 * INVERSE_M)
 
 
 def _level(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], float, str]:

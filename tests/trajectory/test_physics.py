@@ -146,7 +146,7 @@ def test_a_quarter_turn_of_yaw_is_named_and_corrected(course: Course) -> None:
 
 
 @pytest.mark.parametrize(
-    ("yaw_deg", "unless"), [(90.0, ""), (180.0, "unless the velocities in topics.twist")]
+    ("yaw_deg", "unless"), [(90.0, ""), (180.0, "unless the vehicle reverses all the way")]
 )
 def test_without_orientations_axes_that_are_turned_leave_nothing_to_smooth(
     yaw_deg: float, unless: str

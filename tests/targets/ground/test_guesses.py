@@ -68,6 +68,17 @@ def test_what_one_lidar_has_alone_is_its_guess() -> None:
     assert finding.value == pytest.approx((1.4,), abs=0.01)
 
 
+def test_guesses_that_are_inverse_are_named() -> None:
+    grounds = [seen("front", 2.3), seen("rear", 2.4)]
+    guessed = config({"front": -1.8, "rear": -1.9})
+    (finding,) = guess_findings("drive", misfits(grounds, guessed), guessed)
+    assert "all inverses fit. Enter where a LiDAR is in the vehicle frame" in finding.sentence
+    assert (finding.input, finding.value) == ("lidars.front.initial.xyz", (1.8,))
+    guessed = config({"front": 1.8, "rear": -1.9, "left": 1.0})
+    (finding,) = guess_findings("drive", misfits([*grounds, seen("left", 1.5)], guessed), guessed)
+    assert "the inverse of that of lidar 'rear' fits" in finding.sentence
+
+
 def test_guesses_within_their_sigmas_are_no_finding() -> None:
     # The corners of uniform errors of +-0.1 m, whose sigma is 0.058 m.
     for errors in ((0.1, 0.1), (0.1, -0.1), (-0.1, -0.1)):

@@ -450,8 +450,8 @@ def _height(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], flo
             f"the inverse of that of lidar '{first}' fits" if misfit.lidar else "all inverses fit"
         )
         text += (
-            f"{whose}. Enter where a LiDAR is in the vehicle frame (T_vehicle_lidar), not where the "
-            "vehicle is in its own"
+            f"{whose}. Enter where a LiDAR is in the vehicle frame (T_vehicle_lidar), not where "
+            "the vehicle is in its own"
         )
         return f"lidars.{first}.initial.xyz", (value,), misfit.sigma, text
     if misfit.lidar:

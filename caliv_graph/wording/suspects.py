@@ -120,7 +120,7 @@ def apart_finding(
         f"'{second}' are {1e3 * abs(apart_s):.2f} +- {1e3 * sigma_s:.2f} ms {way} than those of "
         f"'{first}' ({sigmas:.0f} sigma), and S2S may be off by how far the vehicle moves "
         "meanwhile. Synchronise their clocks, or set solve.time_offset; clouds of a whole sweep "
-        "without a time per point look the same",
+        "without a time per point look the same, and no offset mends them",
     )
 
 
@@ -200,7 +200,8 @@ _REMEDIES = {
 _REMEDIES_OF_LIDAR = {
     "time_offset": (
         "Correct the clock of lidar '{lidar}', or set solve.time_offset; if it is off by a sweep, "
-        "set lidars.{lidar}.stamp: start or end"
+        "set lidars.{lidar}.stamp: start or end. Clouds of a whole sweep without a time per point "
+        "look the same, and no offset mends them"
     ),
     "initial": (
         "Check the initial guess of lidar '{lidar}' (metres, degrees, signs, T_vehicle_lidar and "

@@ -55,7 +55,8 @@ def test_a_coordinate_that_is_not_determined_has_no_number() -> None:
 def test_a_clock_is_late_or_early_and_has_a_key() -> None:
     text = ranking_sentence([suspect("lidars.rear.time_offset", 9.0, 9.0)])
     assert "the stamps are 0.100 +- 0.010 s late" in text
-    assert text.endswith("if it is off by a sweep, set lidars.rear.stamp: start or end")
+    assert "if it is off by a sweep, set lidars.rear.stamp: start or end" in text
+    assert text.endswith("without a time per point look the same, and no offset mends them")
 
 
 def test_nothing_is_said_below_five_sigma() -> None:

@@ -242,7 +242,8 @@ FRAME_ARM_M = 5.0
 
 def frame_sigmas(nuisances: Nuisances) -> Array:
     """(6,) 1 sigma of turn (rad) and shift (m) of the frame in which a LiDAR sees all strips."""
-    turn_rad = FRAME_PART * float(np.median(nuisances.sighting_tilt))
+    tilts = nuisances.sighting_tilt
+    turn_rad = FRAME_PART * float(np.median(tilts)) if len(tilts) else 0.0
     return np.repeat([turn_rad, FRAME_ARM_M * turn_rad], 3)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -9,12 +10,14 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.calibration import check as checks
 from caliv_graph.calibration.check import strains, unexplained
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.vehicle_parameters import KEYS
+from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_vehicle
 from caliv_graph.geometry.chart import PoseChart
-from caliv_graph.products import Solution, Suspect
+from caliv_graph.products import Calibration, Solution, Suspect, VehicleParameter
 from caliv_graph.trajectory.factors import Gaussian
 from caliv_graph.trajectory.parameters import LEVER_ARM
 from caliv_graph.uncertainty.consistency import Heading
@@ -88,3 +91,28 @@ def test_a_turn_of_all_poses_beside_a_shift_is_no_heave() -> None:
     (found,) = strains(cast(Solution, solution), ["drive"])
     assert found.chi_square == pytest.approx(1.25, rel=1e-6)
     assert 2.0 * gaussian.factor().error(values) > 50.0
+
+
+@pytest.mark.parametrize(("sigmas", "said"), [(3.0, True), (8.0, False)])
+def test_a_clock_that_another_mistake_makes_late_is_not_to_be_corrected(
+    sigmas: float, said: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suspect = Suspect("gnss.lever_arm", (0.3,), (0.02,), (0.3,), ("m",), 0.9, sigmas, sigmas)
+    late = VehicleParameter(np.array([0.012]), np.array([0.0025]), (True,))
+    nothing = np.zeros((0, 0))
+    calibration = Calibration("ok", "", {}, nothing, nothing, (), (), (), {})
+    calibration = replace(calibration, vehicle={"gnss_time_offset": late})
+    for name, value in {
+        "_between_parts": ((), ()),
+        "ranked_suspects": (suspect,),
+        "cloud_counts": (),
+        "registration_sigma": None,
+        "assumptions": (),
+        "typical_speed": 1.0,
+        "strains": (),
+    }.items():
+        monkeypatch.setattr(checks, name, lambda *_, value=value: value)
+    solution = cast("Solution", SimpleNamespace(registration_scale=1.0, range_bias_m=0.0))
+    config = cast("Config", None)  # of the suspects
+    _, warnings = checks.check(calibration, solution, [], [], {}, config)
+    assert any("correct the clock" in warning for warning in warnings) == said

@@ -29,6 +29,7 @@ class Solves:
 
     second: str | CalivError = "ok"
     structure: tuple[object, ...] = ("walls",)
+    named: bool = False
     count: CloudCount = field(
         default_factory=lambda: CloudCount(
             "a", 16, 16, (8, 8), (8, 8), (8, 8), (8, 8), np.array([-0.94, 2.38, 0.26])
@@ -41,11 +42,12 @@ class Solves:
         first = self.refused[-1] is None
         if not first and isinstance(self.second, CalivError):
             raise self.second
-        return SimpleNamespace(
+        run = SimpleNamespace(
             calibration=SimpleNamespace(status="inconsistent" if first else self.second),
             solution=SimpleNamespace(structure=self.structure),
             record=SimpleNamespace(trajectories=()),
         )
+        return run, self.named
 
     def status(self, config: Config) -> str:
         with pytest.MonkeyPatch.context() as patch:
@@ -80,10 +82,11 @@ def counted(outliers: int, offset_m: float) -> CloudCount:
     [
         (Solves(), config_of(target=[{"min": [0, 0, 0], "max": [1, 1, 1]}])),
         (Solves(structure=()), config_of()),
+        (Solves(named=True), config_of()),
         (Solves(count=counted(16, 0.1)), config_of()),
         (Solves(count=counted(6, 2.0)), config_of()),
     ],
-    ids=["a region is given", "no walls", "the same object", "a few clouds"],
+    ids=["a region is given", "no walls", "a mistake is named", "the same object", "a few clouds"],
 )
 def test_else_a_contradiction_is_one(solves: Solves, config: Config) -> None:
     assert solves.status(config) == "inconsistent"

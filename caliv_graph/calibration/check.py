@@ -103,7 +103,7 @@ def check(
                     heading.sigma_rad,
                     told_apart=heading.measured or math.isfinite(heading.axle_m),
                     measured=heading.measured,
-                    oriented=heading.oriented,
+                    source=heading.source,
                 )
                 for index, heading in headings.items()
             ],

@@ -8,7 +8,7 @@ is needed for this, and no guess that is nearly right.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -34,6 +34,9 @@ past a chair and a few other objects: 2.3 to 15 for what was wrong, 1.3 at most 
 ALIKE = 0.9
 """Explanations that sharpen the maps nearly as much: then the one whose guesses are nearer holds.
 On an arc a mounting may turn about the centre of the arc."""
+
+HANGS_M = 0.4
+"""Largest difference between the height of a LiDAR by its guess and by the ground, if it hangs."""
 
 UPSIDE_DOWN = math.cos(math.radians(135.0))
 """Cosine of the angle between up by the guess and up by the ground, from which a LiDAR hangs."""
@@ -91,13 +94,17 @@ def doubts(
     trajectories: Sequence[VehicleTrajectory],
     config: Config,
     progress: Progress,
+    blamed: Collection[str] = (),
 ) -> tuple[Doubt, ...]:
     """The mistake that each drive shows, if it shows one; the same one of a guess only once.
 
-    Clouds are read again: it is asked where something is wrong already.
+    Clouds are read again: it is asked where something is wrong already. `blamed` are LiDARs whose
+    guess a solve contradicts: only of these is it asked whether they are upside down, as a ceiling
+    looks like the ground of a LiDAR that hangs.
 
     Raises:
         RecordingError: a cloud could not be read.
+        TrajectoryError: times of points are invalid.
     """
     found: dict[tuple[object, ...], Doubt] = {}
     names = [
@@ -110,7 +117,7 @@ def doubts(
         if isinstance(trajectory, GivenTrajectory) and trajectory.odometry is not None:
             continue  # its path is that of a guess
         views = _views(recording, trajectory, config, names, progress)
-        doubt = _of_drive(drive, recording.name, views, config, given)
+        doubt = _of_drive(drive, recording.name, views, config, given, blamed)
         if doubt is not None:
             of = () if doubt.kind in ("exchanged", "turned", "upside_down") else (drive,)
             found.setdefault((doubt.kind, doubt.lidars, *of), doubt)
@@ -137,12 +144,17 @@ def _views(
 
 
 def _of_drive(
-    drive: int, name: str, views: Mapping[str, View], config: Config, given: bool
+    drive: int,
+    name: str,
+    views: Mapping[str, View],
+    config: Config,
+    given: bool,
+    blamed: Collection[str],
 ) -> Doubt | None:
     """The mistake whose undoing sharpens the maps most; None if none does by much."""
     guesses = {n: config.lidars[n].guess() for n in views}
     for n, T in guesses.items():
-        if np.asarray(T.rotation().matrix())[2] @ views[n].ground.up_lidar < UPSIDE_DOWN:
+        if n in blamed and _hangs(T, views[n], config):
             return _upside_down(drive, name, n, views[n], T, given)
     now = {n: _sharpness(views[n], T)[0] for n, T in guesses.items()}
     best: tuple[float, float, _Trial, dict[str, float]] | None = None
@@ -163,6 +175,14 @@ def _of_drive(
     _, _, trial, then = best
     sharing = {n: (now[n], then[n]) for n in then}
     return Doubt(drive, name, trial.kind, tuple(then), trial.turn_deg, sharing, given)
+
+
+def _hangs(guess: gtsam.Pose3, view: View, config: Config) -> bool:
+    """Whether the ground lies above a LiDAR by its guess, as far away as the guess has it below."""
+    if np.asarray(guess.rotation().matrix())[2] @ view.ground.up_lidar > UPSIDE_DOWN:
+        return False
+    height_m = config.ground.vehicle_height
+    return height_m is None or abs(guess.z() + height_m - view.ground.height_m) < HANGS_M
 
 
 def _upside_down(

@@ -1,8 +1,8 @@
-"""Usual mistakes of a config, where a LiDAR does not see the target: what explains it."""
+"""Usual mistakes of a config, where a LiDAR sees no target or its guess is contradicted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 from caliv_graph.common.progress import Progress
@@ -21,14 +21,18 @@ def mistakes(
     progress: Progress,
     raw: Sequence[Finding],
     observations: Sequence[TargetObservation] = (),
+    blamed: Collection[str] = (),
 ) -> tuple[Doubt, ...]:
-    """Mistakes that explain why LiDARs do not see the target; none if all see it.
+    """Mistakes that explain why LiDARs do not see the target, or why guesses are contradicted.
+
+    None if all LiDARs see the target. `blamed` are those whose guess a solve contradicts.
 
     None either if the raw sensors (`raw`) or the course contradict the attitude of an IMU: a
     trajectory that was smoothed from these is no evidence. `observations` are of the target.
 
     Raises:
         RecordingError: a cloud could not be read.
+        TrajectoryError: times of points are invalid.
     """
     seeing = {cloud.lidar for o in observations for cloud in o.clouds}
     recorded = {n for r in recordings for n in config.lidars if len(r.scan_stamps_ns(n))}
@@ -38,7 +42,7 @@ def mistakes(
         return ()
     if heading_findings(trajectories, motions, config, raw):
         return ()
-    return doubts(recordings, trajectories, config, progress)
+    return doubts(recordings, trajectories, config, progress, blamed)
 
 
 def without_remedies(

@@ -30,6 +30,7 @@ from caliv_graph.physics import (
     contradicted,
     contradictions_of,
     ranked_with,
+    raw_findings,
     warnings_of,
 )
 from caliv_graph.pipeline.mistakes import mistakes
@@ -43,7 +44,7 @@ from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
-from caliv_graph.uncertainty.consistency import too_many_outliers
+from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS, too_many_outliers
 from caliv_graph.wording.contradictions import outliers_text
 from caliv_graph.wording.mounting import mistake_sentence
 from caliv_graph.wording.structure import nothing_sentence, wrong_target_sentence
@@ -81,13 +82,13 @@ def _calibrate(
     # The report shows the scans as they are read; nothing is read for it.
     sampled = [SampledRecording(recording) for recording in recordings]
     read = motions_of(sampled, config, progress)
-    run = _calibrated(sampled, config, progress, prior, read)
+    run, named = _calibrated(sampled, config, progress, prior, read)
     refused = no_target_of(run, config)
-    if refused is None:
+    if refused is None or named:
         return run
     again = [SampledRecording(recording) for recording in recordings]
     try:
-        alone = _calibrated(again, config, progress, prior, read, refused)
+        alone, _ = _calibrated(again, config, progress, prior, read, refused)
     except CalivError:
         return run
     # A wrong guess or clock contradicts walls, too: then the target shows it as well.
@@ -122,8 +123,8 @@ def _calibrated(
     prior: Calibration | None,
     read: tuple[dict[int, MotionData], Config, tuple[str, ...]],
     refused: TargetError | None = None,
-) -> CalibrationRun:
-    """One statement per stage.
+) -> tuple[CalibrationRun, bool]:
+    """One statement per stage; and whether a mistake of the config was named.
 
     Args:
         sampled: the drives.
@@ -172,12 +173,16 @@ def _calibrated(
         names = [recording.name for recording in recordings]
         clocks = clock_findings(names, solution.structure, calibration)
         findings = (*prepared.findings, *clocks)
-        said = prepared.mistakes
-        if not said and _blames_a_guess(calibration):
-            with_any = mistakes(
-                recordings, prepared.trajectories, motions, guessed, progress, prepared.findings
-            )
-            said = tuple(mistake_sentence(doubt, guessed) for doubt in with_any)
+        said, unread = prepared.mistakes, ""
+        if not said and prior is None and (blamed := _blamed(calibration)):
+            raw, smoothed = raw_findings(motions, guessed), prepared.trajectories
+            try:
+                found = mistakes(
+                    recordings, smoothed, motions, guessed, progress, raw, blamed=blamed
+                )
+            except CalivError as error:
+                found, unread = (), f"usual mistakes of the config were not looked for: {error}"
+            said = tuple(mistake_sentence(doubt, guessed) for doubt in found)
         if said:
             # What a solve from a mistaken guess or heading contradicts has that cause.
             calibration = replace(calibration, contradictions=())
@@ -188,7 +193,7 @@ def _calibrated(
         )
         calibration, conflicts = with_prior(calibration, prior, config)
 
-    doubts = (*doubts, *warnings_of(clocks))
+    doubts = (*doubts, *warnings_of(clocks), *([unread] if unread else []))
     of_prior = calibration.warnings
     warnings = (*notes, *prepared.warnings, *solution.warnings, *doubts, *conflicts, *of_prior)
     record = RunRecord(
@@ -198,14 +203,23 @@ def _calibrated(
         scene={drive: recording.kept() for drive, recording in enumerate(sampled)},
     )
     calibration = replace(calibration, warnings=tuple(dict.fromkeys(warnings)))
-    return CalibrationRun(calibration, solution, prepared.observations, record)
+    run = CalibrationRun(calibration, solution, prepared.observations, record)
+    return run, bool(said)
 
 
-def _blames_a_guess(calibration: Calibration) -> bool:
-    """Whether something is wrong, and no input of the motion explains it best."""
+def _blamed(calibration: Calibration) -> tuple[str, ...]:
+    """LiDARs whose guess is contradicted; none if an input of the motion explains more."""
+    if calibration.status != "inconsistent":
+        return ()
     first = calibration.suspects[:1]
-    return calibration.status == "inconsistent" and all(
-        suspect.input.startswith("lidars.") for suspect in first
+    if any(s.sigmas > CONTRADICTION_SIGMAS and not s.input.endswith(".initial") for s in first):
+        return ()
+    leading = {s.input for s in first if s.sigmas > CONTRADICTION_SIGMAS}
+    said = " ".join(calibration.contradictions)
+    return tuple(
+        name
+        for name in calibration.lidars
+        if f"lidars.{name}.initial" in leading or f"'{name}'" in said
     )
 
 

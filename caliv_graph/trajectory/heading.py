@@ -7,7 +7,9 @@ shows it: its rear axle does not slip sideways.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -42,6 +44,24 @@ MIN_CURVATURE_RANGE_1_M = 0.02
 above which an axle's place explains a yaw: a turning radius of 50 m."""
 
 
+HeadingSource = Literal["imu", "antennas", "none"]
+
+HEADING_REMEDIES: Mapping[HeadingSource, str] = {
+    "imu": "Check imu.T_vehicle_imu, or set imu.yaw_bias",
+    "antennas": "Check heading.yaw_deg and the antennas of topics.heading",
+    "none": "Check imu.T_vehicle_imu",
+}
+"""What a heading that is turned against the course comes from, by what tells it."""
+
+_MAP_REMEDIES: Mapping[HeadingSource, str] = {
+    **HEADING_REMEDIES,
+    "imu": (
+        "Check that the IMU's yaw counts from east to the left, and imu.T_vehicle_imu, or set "
+        "imu.yaw_bias"
+    ),
+}
+
+
 @dataclass(frozen=True)
 class HeadingDisagreement:
     """How course over ground and heading differ.
@@ -53,7 +73,8 @@ class HeadingDisagreement:
             curves do not determine it.
         duration_s: of driving that was compared.
         measured: whether the lateral velocity was measured (twist), not assumed to be zero.
-        oriented: whether an orientation source tells the heading; else fixes and gyroscope do.
+        source: what tells the heading: orientations of the IMU's messages, two antennas, or none;
+            then fixes and gyroscope tell that of the IMU.
         warning: a line for the user; empty without a significant disagreement.
     """
 
@@ -62,7 +83,7 @@ class HeadingDisagreement:
     axle_m: float
     duration_s: float
     measured: bool
-    oriented: bool
+    source: HeadingSource
     warning: str
 
 
@@ -85,7 +106,7 @@ def heading_disagreement(
     if duration_s < MIN_DRIVING_S:
         return None
     measured = _measured_at(motion, at[fast], begin)
-    map_turn = _turn_against_fixes(smoothed)
+    map_turn, source = _turn_against_fixes(smoothed), _source(smoothed)
     if abs(map_turn) > MAP_TURN_RAD:
         return HeadingDisagreement(
             yaw_rad=map_turn,
@@ -93,11 +114,11 @@ def heading_disagreement(
             axle_m=math.nan,
             duration_s=duration_s,
             measured=measured is not None,
-            oriented=smoothed.data.orientation,
+            source=source,
             warning=(
                 f"{motion.name}: heading is turned by {math.degrees(map_turn):+.0f} degrees "
-                "against the path of the GNSS fixes, which hardly count therefore. Check that the "
-                "IMU's yaw counts from east to the left, and imu.T_vehicle_imu, or set imu.yaw_bias"
+                "against the path of the GNSS fixes, which hardly count therefore. "
+                f"{_MAP_REMEDIES[source]}"
             ),
         )
     velocity, turn = velocity[fast, :2], rates[fast, 2]
@@ -117,12 +138,12 @@ def heading_disagreement(
     yaw = coarse + float(solution[0])
     warning = ""
     if abs(yaw) > max(SIGMAS * sigma, FLOOR_RAD):
-        or_bias = ", or set imu.yaw_bias" if smoothed.data.orientation else ""
+        axle = _or_axle(yaw, forward, turn, separable or measured is not None)
         warning = (
             f"{motion.name}: heading is turned by {math.degrees(yaw):+.2f} degrees "
             f"(sigma {math.degrees(sigma):.2f}) against the direction in which the vehicle goes: "
-            "yaw of every LiDAR to the vehicle is off by as much. Check imu.T_vehicle_imu"
-            f"{or_bias}{_or_axle(yaw, forward, turn, separable or measured is not None)}"
+            "yaw of every LiDAR to the vehicle is off by as much. "
+            f"{HEADING_REMEDIES[source]}{axle}"
         )
     return HeadingDisagreement(
         yaw_rad=yaw,
@@ -130,9 +151,17 @@ def heading_disagreement(
         axle_m=float(solution[1]) if separable else math.nan,
         duration_s=duration_s,
         measured=measured is not None,
-        oriented=smoothed.data.orientation,
+        source=source,
         warning=warning,
     )
+
+
+def _source(smoothed: SmoothedTrajectory) -> HeadingSource:
+    """What tells the heading of a drive."""
+    data = smoothed.data
+    if data.orientation:
+        return "imu"
+    return "none" if data.headings is None and data.baselines is None else "antennas"
 
 
 def _turn_against_fixes(smoothed: SmoothedTrajectory) -> float:

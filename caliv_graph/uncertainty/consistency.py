@@ -17,6 +17,7 @@ from scipy.special import bdtrc, chdtrc, ndtr
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
 from caliv_graph.products import Array, Guess, LidarResult
+from caliv_graph.trajectory.heading import HeadingSource
 from caliv_graph.uncertainty.observability import UNIT, scaling
 
 CONTRADICTION_SIGMAS = 5.0
@@ -165,8 +166,8 @@ class Heading:
         sigma_rad: of it.
         told_apart: whether the drive separates it from a vehicle frame that is off the rear axle.
         measured: whether lateral velocity was measured: it then contains what the axle does.
-        oriented: whether an orientation source tells the heading; else fixes and gyroscope tell
-            that of the IMU, and `imu.T_vehicle_imu` that of the vehicle.
+        source: orientations of the IMU's messages tell the heading, two antennas, or none; then
+            fixes and gyroscope tell that of the IMU, and `imu.T_vehicle_imu` the vehicle's.
     """
 
     drive: str
@@ -174,7 +175,7 @@ class Heading:
     sigma_rad: float
     told_apart: bool
     measured: bool = False
-    oriented: bool = True
+    source: HeadingSource = "imu"
 
     @property
     def sigma_with_allowance_rad(self) -> float:

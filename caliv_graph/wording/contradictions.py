@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.special import ndtri
 
 from caliv_graph.conventions import AXES
+from caliv_graph.trajectory.heading import HEADING_REMEDIES, HeadingSource
 from caliv_graph.uncertainty.consistency import (
     FAR_M,
     OUTLIERS,
@@ -234,14 +236,22 @@ def _assumed(found: Assumed) -> str:
     )
 
 
+_HEADING_SOURCES: Mapping[HeadingSource, str] = {
+    "imu": "the orientation source",
+    "antennas": "the direction by two antennas",
+    "none": "the yaw of imu.T_vehicle_imu",
+}
+
+
 def _heading(found: Heading) -> str:
     sigma, off_deg = found.sigma_with_allowance_rad, math.degrees(found.yaw_rad)
-    source = "the orientation source and" if found.oriented else "the yaw of imu.T_vehicle_imu and"
-    remedy = "Check imu.T_vehicle_imu, or set imu.yaw_bias"
-    if not found.oriented:
-        remedy = f"Check imu.T_vehicle_imu: {off_deg:+.1f} degrees more of yaw would fit"
+    source = _HEADING_SOURCES[found.source]
+    remedy = HEADING_REMEDIES[found.source]
+    if found.source == "none":
+        remedy += f": {off_deg:+.1f} degrees more of yaw would fit"
     return (
-        f"{found.drive}: {source} the direction of travel contradict each other by {off_deg:+.2f} "
-        f"+- {math.degrees(sigma):.2f} degrees ({abs(found.yaw_rad) / sigma:.0f} sigma): the S2V "
-        f"yaw of every LiDAR has the same error. {remedy}"
+        f"{found.drive}: {source} and the direction of travel contradict each other by "
+        f"{off_deg:+.2f} +- {math.degrees(sigma):.2f} degrees "
+        f"({abs(found.yaw_rad) / sigma:.0f} sigma): the S2V yaw of every LiDAR has the same error. "
+        f"{remedy}"
     )

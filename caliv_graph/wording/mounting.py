@@ -104,7 +104,7 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
         return (
             f"{whose} are left-handed: y points to the right, with x forward and z up",
             "With the sign of y changed",
-            "Write the points with y to the left; simulators and converters often leave it",
+            "Write the points with y to the left",
         )
     remedy = "Set data.pose_axes: ned"
     if config.data.format == "caliv":

@@ -41,7 +41,7 @@ def late_clock_sentences(vehicle: Mapping[str, VehicleParameter]) -> Iterator[st
             yield (
                 f"{key}: the stamps seem {size} {way} against the other sensors, or "
                 f"{_LOOKS_THE_SAME[name]} is wrong: this drive hardly tells them apart, and the "
-                "extrinsics count either. Measure the arm again, and check the clock"
+                "extrinsics count either. Check both"
             )
 
 

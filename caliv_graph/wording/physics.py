@@ -79,7 +79,7 @@ def motion_findings(found: MotionPhysics, config: Config) -> tuple[Finding, ...]
         return (_gravity(found, config), *_rates(found))
     out = [*_rates(found), *heading]
     if axes is not None:
-        told = found.oriented or found.heading is not None
+        told = found.oriented or config.topics.heading is not None
         out += _axes(found.name, axes, config, told)
     return tuple(out)
 
@@ -242,7 +242,7 @@ def _axes(name: str, axes: Axes, config: Config, told: bool) -> Iterator[Finding
     """The accelerometer's horizontal axes against the path of the GNSS antenna.
 
     `told`: something else tells the heading. Nothing can be smoothed with an IMU that is turned by
-    a quarter turn and more, if it is all that does.
+    60 degrees and more, if it is all that does; without velocities it may be a drive in reverse.
     """
     if axes.mirrored:
         yield Finding(
@@ -259,19 +259,17 @@ def _axes(name: str, axes: Axes, config: Config, told: bool) -> Iterator[Finding
     R = known_rotation(config)
     if R is not None and abs(axes.yaw_rad) > MIN_YAW_RAD and sigmas > CONTRADICTION_SIGMAS:
         value = _degrees(gtsam.Rot3.Rz(axes.yaw_rad).matrix() @ R)
-        unless = ""
-        if abs(axes.yaw_rad) > REVERSED_RAD:
-            unless = (
-                ", unless the velocities in topics.twist have the wrong sign"
-                if config.topics.twist is not None
-                else ", unless the vehicle reverses all the way"
-            )
+        unless, fatal = "", not told and abs(axes.yaw_rad) > TURNED_RAD
+        if abs(axes.yaw_rad) > REVERSED_RAD and config.topics.twist is not None:
+            unless = ", unless the velocities in topics.twist have the wrong sign"
+        elif abs(axes.yaw_rad) > REVERSED_RAD:
+            unless, fatal = ", unless the vehicle reverses all the way", False
         yield Finding(
             "imu.T_vehicle_imu",
             value,
             math.degrees(axes.sigma_rad),
             sigmas,
-            "contradiction" if told or abs(axes.yaw_rad) < TURNED_RAD else "fatal",
+            "fatal" if fatal else "contradiction",
             f"{name}: the IMU's axes are turned by {math.degrees(axes.yaw_rad):+.0f} +- "
             f"{math.degrees(axes.sigma_rad):.0f} degrees of yaw against the accelerations of the "
             f"path: imu.T_vehicle_imu rpy_deg about {_rpy(value)} would fit{unless}",
@@ -443,17 +441,6 @@ def _height(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], flo
         f"fit together (chi2 {misfit.chi2:.1f} of {misfit.dof}): "
     )
     fits = f"would fit ({misfit.sigmas:.1f} sigma)"
-    if _fit_inversely(misfit, config):
-        first = misfit.lidar or next(iter(config.lidars))
-        value = float(config.lidars[first].guess().inverse().z())
-        whose = (
-            f"the inverse of that of lidar '{first}' fits" if misfit.lidar else "all inverses fit"
-        )
-        text += (
-            f"{whose}. Enter where a LiDAR is in the vehicle frame (T_vehicle_lidar), not where "
-            "the vehicle is in its own"
-        )
-        return f"lidars.{first}.initial.xyz", (value,), misfit.sigma, text
     if misfit.lidar:
         key = f"lidars.{misfit.lidar}.initial.xyz"
         value = float(config.lidars[misfit.lidar].guess().z()) + misfit.value
@@ -464,6 +451,11 @@ def _height(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], flo
         text += f"vehicle_height {value:.2f} +- {misfit.sigma:.2f} m {fits}"
         if misfit.dof == 1:
             text += f", or z of lidar '{next(iter(config.lidars))}' is wrong"
+    if _fit_inversely(misfit, config):
+        text += (
+            "; with the other sign z fits as well. Check that guesses say where a LiDAR is in the "
+            "vehicle frame, z up (T_vehicle_lidar), and are not the inverse"
+        )
     return key, (value,), misfit.sigma, text
 
 
@@ -472,7 +464,7 @@ INVERSE_M = 0.3
 
 
 def _fit_inversely(misfit: Misfit, config: Config) -> bool:
-    """Whether the ground lies where the inverses of the guesses have it that are off."""
+    """Whether guesses that are off lie below the vehicle, and their inverses fit."""
     names = [misfit.lidar] if misfit.lidar else list(config.lidars)
     if any(config.lidars[name].initial is None for name in names):
         return False
@@ -480,7 +472,7 @@ def _fit_inversely(misfit: Misfit, config: Config) -> bool:
     now = np.array([T.z() for T in guesses])
     inverse = np.array([T.inverse().z() for T in guesses])
     fits = np.abs(inverse - now - misfit.value) < INVERSE_M
-    return bool(fits.all() and abs(misfit.value) > 2.0 * INVERSE_M)
+    return bool(fits.all() and misfit.value > 2.0 * INVERSE_M)
 
 
 def _level(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], float, str]:

@@ -29,7 +29,7 @@ def rough_ground_sentence(drive: str, roughness_m: float, sigma_m: float, used_m
         f"{drive}: the ground scatters by {1e3 * roughness_m:.0f} mm from point to point, as grass "
         "or gravel does: LiDARs see its tips, wheels sink in. ground.vehicle_height is believed to "
         f"{1e3 * used_m:.0f} mm in place of ground.sigma ({1e3 * sigma_m:.3g} mm), and z of all "
-        "LiDARs with it. Record a drive on asphalt or concrete for z"
+        "LiDARs with it, in all drives. For z use drives on asphalt or concrete alone"
     )
 
 

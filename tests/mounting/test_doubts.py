@@ -81,13 +81,23 @@ def test_a_lidar_that_is_the_other_way_up(axis: str, word: str) -> None:
     over = gtsam.Rot3.Rx(math.pi) if axis == "x" else gtsam.Rot3.Ry(math.pi)
     guess = REAR.compose(ERROR).compose(gtsam.Pose3(over, np.zeros(3)))
     config = config_of(front=FRONT.compose(ERROR), rear=guess)
-    (doubt,) = found(config)
+    (doubt,) = doubts([DRIVE], [DRIVE.way], config, SilentProgress(), ("rear",))
     assert (doubt.kind, doubt.lidars) == ("upside_down", ("rear",))
     text = mistake_sentence(doubt, config)
     assert "the initial guess has lidar 'rear' upside down" in text
     assert f"({word} about 180 degrees off)" in text
     right = np.degrees(REAR.compose(ERROR).rotation().rpy())
     assert f"about [{', '.join(f'{angle:.1f}' for angle in right)}]" in text
+
+
+def test_a_ceiling_is_no_ground_of_a_lidar_whose_guess_nothing_contradicts() -> None:
+    over = gtsam.Pose3(gtsam.Rot3.Rx(math.pi), np.zeros(3))
+    hanging = config_of(front=FRONT.compose(ERROR), rear=REAR.compose(over))
+    assert all(doubt.kind != "upside_down" for doubt in found(hanging))
+    low = gtsam.Pose3(REAR.rotation(), REAR.translation() - [0.0, 0.0, 1.2])
+    elsewhere = config_of(front=FRONT.compose(ERROR), rear=low.compose(over))
+    for doubt in doubts([DRIVE], [DRIVE.way], elsewhere, SilentProgress(), ("rear",)):
+        assert doubt.kind != "upside_down"
 
 
 def test_a_heading_that_points_backwards() -> None:

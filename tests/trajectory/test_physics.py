@@ -146,22 +146,27 @@ def test_a_quarter_turn_of_yaw_is_named_and_corrected(course: Course) -> None:
 
 
 @pytest.mark.parametrize(
-    ("yaw_deg", "unless"), [(90.0, ""), (180.0, "unless the vehicle reverses all the way")]
+    ("yaw_deg", "topics", "severity", "unless"),
+    [
+        (40.0, {}, "contradiction", ""),
+        (90.0, {}, "fatal", ""),
+        (90.0, {"heading": "/heading"}, "contradiction", ""),
+        (180.0, {}, "contradiction", "unless the vehicle reverses all the way"),
+        (180.0, {"twist": "/twist"}, "fatal", "unless the velocities in topics.twist"),
+    ],
 )
 def test_without_orientations_axes_that_are_turned_leave_nothing_to_smooth(
-    yaw_deg: float, unless: str
+    yaw_deg: float, topics: dict[str, object], severity: str, unless: str
 ) -> None:
     """The smoother took minutes for a path that fixes and accelerations do not share."""
     motion = recorded(EIGHT, 0)
     assert motion.imu is not None
     blind = replace(motion, imu=replace(motion.imu, orientation_xyzw=None))
-    for of, severity in ((motion, "contradiction"), (blind, "fatal")):
-        found = found_in(of, imu=mounted(0.0, 0.0, yaw_deg))
+    topics = {"imu": "/imu", "gnss": "/gnss", **topics}
+    for of, expected in ((motion, "contradiction"), (blind, severity)):
+        found = found_in(of, imu=mounted(0.0, 0.0, yaw_deg), topics=topics)
         (turned,) = (f for f in found if f.input == "imu.T_vehicle_imu")
-        assert turned.severity == severity
-        assert unless in turned.sentence
-    (small,) = found_in(blind, imu=mounted(0.0, 0.0, 40.0))
-    assert small.severity == "contradiction"
+        assert (turned.severity, unless in turned.sentence) == (expected, True)
 
 
 @pytest.mark.parametrize("late_s", [0.3, -0.2])

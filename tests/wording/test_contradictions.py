@@ -161,11 +161,13 @@ def test_a_heading_comes_with_its_angle_and_the_allowance() -> None:
 
 
 def test_without_an_orientation_source_the_mounting_of_the_imu_is_what_tells_the_heading() -> None:
-    found = Heading("drive", math.radians(-3.0), 1e-3, told_apart=True, oriented=False)
+    found = Heading("drive", math.radians(-3.0), 1e-3, told_apart=True, source="none")
     text = contradiction_sentence(found)
     assert "the yaw of imu.T_vehicle_imu and the direction of travel" in text
     assert text.endswith("Check imu.T_vehicle_imu: -3.0 degrees more of yaw would fit")
-    assert "yaw_bias" in contradiction_sentence(replace(found, oriented=True))
+    assert "yaw_bias" in contradiction_sentence(replace(found, source="imu"))
+    text = contradiction_sentence(replace(found, source="antennas"))
+    assert text.endswith("Check heading.yaw_deg and the antennas of topics.heading")
 
 
 def test_ranges_that_disagree_give_no_advice_after_a_suspect() -> None:

@@ -68,15 +68,21 @@ def test_what_one_lidar_has_alone_is_its_guess() -> None:
     assert finding.value == pytest.approx((1.4,), abs=0.01)
 
 
-def test_guesses_that_are_inverse_are_named() -> None:
+def test_guesses_that_are_inverse_are_said_beside_the_height() -> None:
     grounds = [seen("front", 2.3), seen("rear", 2.4)]
     guessed = config({"front": -1.8, "rear": -1.9})
     (finding,) = guess_findings("drive", misfits(grounds, guessed), guessed)
-    assert "all inverses fit. Enter where a LiDAR is in the vehicle frame" in finding.sentence
-    assert (finding.input, finding.value) == ("lidars.front.initial.xyz", (1.8,))
-    guessed = config({"front": 1.8, "rear": -1.9, "left": 1.0})
-    (finding,) = guess_findings("drive", misfits([*grounds, seen("left", 1.5)], guessed), guessed)
-    assert "the inverse of that of lidar 'rear' fits" in finding.sentence
+    assert finding.input == "ground.vehicle_height"
+    assert "with the other sign z fits as well. Check that guesses" in finding.sentence
+
+
+@pytest.mark.parametrize("height_m", [1.05, 3.0])
+def test_a_wrong_vehicle_height_is_no_inverse(height_m: float) -> None:
+    guessed = config({"front": 0.35, "rear": 0.3}, vehicle_height=1.7)
+    grounds = [seen("front", 0.35 + height_m), seen("rear", 0.3 + height_m)]
+    (finding,) = guess_findings("drive", misfits(grounds, guessed), guessed)
+    assert finding.input == "ground.vehicle_height"
+    assert "other sign" not in finding.sentence
 
 
 def test_guesses_within_their_sigmas_are_no_finding() -> None:

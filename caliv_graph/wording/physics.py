@@ -77,11 +77,34 @@ def motion_findings(found: MotionPhysics, config: Config) -> tuple[Finding, ...]
     if found.gravity.tilt_rad > MAX_GRAVITY_TILT_RAD:
         # Nothing else can be judged about wrong axes, but units can.
         return (_gravity(found, config), *_rates(found))
+    mirrored = _mirrored_fixes(found)
+    if mirrored is not None:
+        return (mirrored,)  # what else such fixes contradict has that cause
     out = [*_rates(found), *heading]
     if axes is not None:
         told = found.oriented or config.topics.heading is not None
         out += _axes(found.name, axes, config, told)
     return tuple(out)
+
+
+def _mirrored_fixes(found: MotionPhysics) -> Finding | None:
+    """Fixes whose path turns left where the IMU turns right, by its rates and its accelerations."""
+    by_course = next((ratio for ratio in found.gyroscope if ratio.against == "course"), None)
+    if by_course is None or found.axes is None or not found.axes.mirrored:
+        return None
+    sigmas = -by_course.value / by_course.sigma
+    if sigmas < WARNING_SIGMAS:  # the accelerations are evidence of their own
+        return None
+    return Finding(
+        "topics.gnss",
+        (),
+        0.0,
+        sigmas,
+        "fatal",
+        f"{found.name}: the path of the GNSS fixes turns left where the IMU turns right, by its "
+        "rates and its accelerations. Either latitude and longitude are swapped in topics.gnss, or "
+        "the axes of the IMU's messages are left-handed",
+    )
 
 
 def gravity_problem(up_imu: Array, R_vehicle_imu: Array) -> str:
@@ -191,7 +214,8 @@ def _ratio(name: str, ratio: Ratio, key: str, units: dict[float, str]) -> Iterat
         remedy = (
             f"This is {unit}: convert them"
             if "sign" not in unit
-            else f"They have the opposite sign: check the axes of {key}"
+            else f"They have the opposite sign: check the axes of {key}, and that latitude and "
+            "longitude are not swapped"
         )
     gross: Literal["contradiction", "warning"] = "contradiction" if off > GROSS_RATIO else "warning"
     value = f"{ratio.value:.3g} +- {ratio.sigma:.1g}"

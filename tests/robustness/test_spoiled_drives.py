@@ -33,7 +33,7 @@ EXPECTED = {
     "IMU with z down": (2, "on where up is"),
     "orientation w first": (2, "on where up is"),
     "latitude in radians": (2, ""),
-    "latitude and longitude swapped": (2, ""),
+    "latitude and longitude swapped": (2, "latitude and longitude are"),
     "clouds left-handed": (2, ""),
     "clouds upside down": (2, ""),
     "stamps backwards": (2, ""),

@@ -127,6 +127,18 @@ def test_a_wrong_imu_is_named(
         assert said in found.sentence
 
 
+def test_swapped_latitude_and_longitude_are_named() -> None:
+    """A mirrored path: nothing else that it contradicts is said."""
+    for seed in SEEDS:
+        motion = recorded(EIGHT, seed)
+        gnss = motion.gnss
+        assert gnss is not None
+        swapped = replace(gnss, latitude_deg=gnss.longitude_deg, longitude_deg=gnss.latitude_deg)
+        (found,) = found_in(replace(motion, gnss=swapped))
+        assert (found.input, found.severity) == ("topics.gnss", "fatal")
+        assert "latitude and longitude are swapped" in found.sentence
+
+
 def test_the_unit_of_the_velocities_is_named() -> None:
     motion = recorded(EIGHT, 0)
     assert motion.twist is not None

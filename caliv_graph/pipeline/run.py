@@ -86,7 +86,8 @@ def _calibrate(
     refused = no_target_of(run, config)
     if refused is None or named:
         return run
-    again = [SampledRecording(recording) for recording in recordings]
+    with progress.stage("calibrating again, without that target", None):
+        again = [SampledRecording(recording) for recording in recordings]
     try:
         alone, _ = _calibrated(again, config, progress, prior, read, refused)
     except CalivError:

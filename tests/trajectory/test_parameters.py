@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 
 from caliv_graph.config.model import Config
+from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, GnssFixes, ImuSamples, MotionData
 from caliv_graph.trajectory.columns import whitening
+from caliv_graph.trajectory.inputs import check_input
 from caliv_graph.trajectory.parameters import (
     GNSS_TIME_OFFSET,
     GYROSCOPE,
@@ -133,3 +136,15 @@ def test_the_joint_gaussian_predicts_what_a_moved_parameter_does(
     after, before = (t.estimate() for t in (moved, smoothed))
     gained = after.graph.factors.error(after.values) - before.graph.factors.error(before.values)
     assert gained == pytest.approx(0.5 * d @ reduced @ d - slope @ d, rel=0.05, abs=0.05)
+
+
+@pytest.mark.parametrize("late_s", [4e9, -12.0, math.nan])
+def test_a_clock_that_no_motion_explains_ends_the_estimate(late_s: float) -> None:
+    """Garbage in the fixes moved it beyond what nanoseconds hold."""
+    data, _ = check_input(MOTION, CONFIG)
+    with pytest.raises(TrajectoryError, match="Stamps of the gnss seem"):
+        GNSS_TIME_OFFSET.moved(data, np.array([late_s]))
+    moved = GNSS_TIME_OFFSET.moved(GNSS_TIME_OFFSET.moved(data, np.array([6.0])), np.array([-1.0]))
+    assert moved.late_ns == {"gnss": 5_000_000_000}
+    with pytest.raises(TrajectoryError, match="12 s late"):
+        GNSS_TIME_OFFSET.moved(moved, np.array([7.0]))

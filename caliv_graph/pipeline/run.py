@@ -86,10 +86,10 @@ def _calibrate(
     refused = no_target_of(run, config)
     if refused is None or named:
         return run
-    with progress.stage("calibrating again, without that target", None):
-        again = [SampledRecording(recording) for recording in recordings]
+    again = [SampledRecording(recording) for recording in recordings]
     try:
-        alone, _ = _calibrated(again, config, progress, prior, read, refused)
+        with progress.stage("calibrating again, without that target", None):
+            alone, _ = _calibrated(again, config, progress, prior, read, refused)
     except CalivError:
         return run
     # A wrong guess or clock contradicts walls, too: then the target shows it as well.

@@ -46,6 +46,7 @@ from caliv_graph.readers.sweeps import (
     is_sampled,
     mark_of_clouds,
     times_warnings,
+    untimed_warning,
     with_mark,
 )
 
@@ -203,7 +204,8 @@ class CloudFolder:
             if times.clouds or times.problems:
                 where = f"{self._path}: LiDAR '{lidar}'"
                 lines += times_warnings(where, times, self._marks[lidar], self._period_s(lidar))
-        return lines
+        read = {lidar: times for lidar, times in self._times.items() if self._looked_at[lidar]}
+        return lines + untimed_warning(str(self._path), read)
 
     @cached_property
     def _poses(self) -> GivenPoses | None:

@@ -218,6 +218,31 @@ def test_times_of_pcd_clouds_that_cannot_be_are_told(tmp_path: Path) -> None:
     )
 
 
+def test_clouds_without_times_beside_others_that_have_them_are_told(tmp_path: Path) -> None:
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")]
+    for name, fields in {"top": kinds, "rear": kinds[:3]}.items():
+        (tmp_path / name).mkdir()
+        for k in range(3):
+            table = np.zeros(30, fields)
+            table["x"], table["y"], table["z"] = points_of(k).T
+            if name == "top":
+                table["t"] = np.arange(30) * 3_000_000
+            write_cloud(tmp_path / name / f"{BEGIN + k * PERIOD}.pcd", table)
+    write_tum(tmp_path / "poses.tum")
+    guess = {"initial": {"xyz": [0, 0, 0]}}
+    raw = {
+        "data": {"format": "clouds", "path": str(tmp_path)},
+        "lidars": {name: {"topic": name, **guess} for name in ("top", "rear")},
+    }
+    recording = open_recording(parse_config(raw, "config.yaml", tmp_path))
+
+    list(recording.scans("top"))
+    told = "points of 'rear' have no times, those of 'top' have"
+    assert not any(told in line for line in recording.warnings())  # no cloud of it was read
+    list(recording.scans("rear"))
+    assert any(told in line for line in recording.warnings())
+
+
 def test_fields_of_the_config_and_a_stamp_at_the_end(tmp_path: Path) -> None:
     """As HeLiPR stores an Ouster: 26 bytes per point, times from the start of the sweep."""
     kinds = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "t": "u4", "reflectivity": "u2"}

@@ -34,8 +34,10 @@ from caliv_graph.uncertainty.consistency import (
     Assumed,
     AssumedKind,
     CloudCount,
+    CoarseRegistrations,
     Contradiction,
     GuessContradiction,
+    RangesDisagree,
     ScoreTest,
     Strain,
 )
@@ -68,13 +70,14 @@ def check(
     motions: Mapping[int, MotionData],
     config: Config,
     displaced: bool = False,
-) -> tuple[Calibration, tuple[str, ...]]:
+) -> tuple[Calibration, tuple[str, ...], tuple[str, ...]]:
     """Tests a calibration against its data and its initial guesses.
 
     `recordings` and `trajectories` are one per drive, `motions` by the index of the drive;
     `displaced`: some target is at one place only with late stamps or another guess. Returns
-    the calibration, inconsistent if something contradicts something, with its suspects; and
-    warnings: an input that may be wrong, headings that disagree, and what could not be tested.
+    the calibration, inconsistent if something contradicts something, with its suspects;
+    warnings: an input that may be wrong, headings that disagree, and what could not be tested;
+    and the LiDARs that its contradictions are about.
     """
     headings = _headings(trajectories, motions)
     drives = [Path(recording.name).name for recording in recordings]
@@ -129,7 +132,21 @@ def check(
     doubts = filter(None, [doubt_sentence(suspects)])
     # Beside what is most likely wrong, an offset is what that does to a clock.
     late = () if leads else tuple(late_clock_sentences(calibration.vehicle))
-    return calibration, (*doubts, *late, *disagreements, *untested)
+    concerned = tuple(name for name in calibration.lidars if any(name in _about(f) for f in found))
+    return calibration, (*doubts, *late, *disagreements, *untested), concerned
+
+
+def _about(found: Contradiction) -> tuple[str, ...]:
+    """LiDARs that a finding is about; none if it is about the motion or the ground."""
+    match found:
+        case GuessContradiction(swapped_with=str() as other):
+            return (found.lidar, other)
+        case GuessContradiction() | CloudCount() | ScoreTest():
+            return (found.lidar,)
+        case CoarseRegistrations() | RangesDisagree():
+            return found.lidars
+        case _:
+            return ()
 
 
 def _between_parts(

@@ -162,7 +162,7 @@ def _calibrated(
             trajectories,
             marks,
         )
-        calibration, doubts = check(
+        calibration, doubts, concerned = check(
             calibration,
             solution,
             recordings,
@@ -175,7 +175,7 @@ def _calibrated(
         clocks = clock_findings(names, solution.structure, calibration)
         findings = (*prepared.findings, *clocks)
         said, unread = prepared.mistakes, ""
-        if not said and prior is None and (blamed := _blamed(calibration)):
+        if not said and prior is None and (blamed := _blamed(calibration, concerned)):
             raw, smoothed = raw_findings(motions, guessed), prepared.trajectories
             try:
                 found = mistakes(
@@ -208,19 +208,21 @@ def _calibrated(
     return run, bool(said)
 
 
-def _blamed(calibration: Calibration) -> tuple[str, ...]:
-    """LiDARs whose guess is contradicted; none if an input of the motion explains more."""
+def _blamed(calibration: Calibration, concerned: Sequence[str]) -> tuple[str, ...]:
+    """LiDARs whose guess may be contradicted; none if an input of the motion explains more.
+
+    `concerned` are those that contradictions of the solve are about.
+    """
     if calibration.status != "inconsistent":
         return ()
     first = calibration.suspects[:1]
     if any(s.sigmas > CONTRADICTION_SIGMAS and not s.input.endswith(".initial") for s in first):
         return ()
     leading = {s.input for s in first if s.sigmas > CONTRADICTION_SIGMAS}
-    said = " ".join(calibration.contradictions)
     return tuple(
         name
         for name in calibration.lidars
-        if f"lidars.{name}.initial" in leading or f"'{name}'" in said
+        if f"lidars.{name}.initial" in leading or name in concerned
     )
 
 

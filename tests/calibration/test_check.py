@@ -15,12 +15,19 @@ from caliv_graph.calibration.check import strains, unexplained
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.vehicle_parameters import KEYS
 from caliv_graph.config.model import Config
-from caliv_graph.conventions import key_vehicle
+from caliv_graph.conventions import AXES, key_vehicle
 from caliv_graph.geometry.chart import PoseChart
-from caliv_graph.products import Calibration, Solution, Suspect, VehicleParameter
+from caliv_graph.products import Calibration, LidarResult, Solution, Suspect, VehicleParameter
 from caliv_graph.trajectory.factors import Gaussian
 from caliv_graph.trajectory.parameters import LEVER_ARM
-from caliv_graph.uncertainty.consistency import Heading
+from caliv_graph.uncertainty import consistency
+from caliv_graph.uncertainty.consistency import (
+    CloudCount,
+    CoarseRegistrations,
+    Contradiction,
+    Heading,
+    Strain,
+)
 
 TURNED = Heading("drive", 0.04, 0.002, told_apart=True)
 
@@ -99,20 +106,53 @@ def test_a_clock_that_another_mistake_makes_late_is_not_to_be_corrected(
 ) -> None:
     suspect = Suspect("gnss.lever_arm", (0.3,), (0.02,), (0.3,), ("m",), 0.9, sigmas, sigmas)
     late = VehicleParameter(np.array([0.012]), np.array([0.0025]), (True,))
+    calibration = replace(nothing_calibrated(), vehicle={"gnss_time_offset": late})
+    _, warnings, _ = checked(calibration, monkeypatch, ranked_suspects=(suspect,))
+    assert any("correct the clock" in warning for warning in warnings) == said
+
+
+def test_the_lidars_that_contradictions_are_about_are_given_by_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not those whose name a sentence holds for another reason, such as that of the drive."""
+    far = CloudCount("left", 20, 15, (9, 8), (11, 7), (10, 9), (10, 6), np.array([0.4, 0.0, 0.0]))
+    lidars = dict.fromkeys(("roof", "left", "right"), unseen())
+    calibration = replace(nothing_calibrated(), lidars=lidars)
+    found: list[Contradiction] = [far, Strain("roof", 900.0, 100)]
+    monkeypatch.setattr(consistency, "contradictions", lambda _: found)
+    contradicted, _, concerned = checked(calibration, monkeypatch)
+    assert "drive 'roof'" in contradicted.contradictions[1]
+    assert concerned == ("left",)
+    # The registrations of several LiDARs do not fit: any of them may be wrong.
+    found[:] = [CoarseRegistrations(9.0, (0.01, 0.1), ("left", "right"), None)]
+    _, _, concerned = checked(calibration, monkeypatch)
+    assert concerned == ("left", "right")
+
+
+def nothing_calibrated() -> Calibration:
     nothing = np.zeros((0, 0))
-    calibration = Calibration("ok", "", {}, nothing, nothing, (), (), (), {})
-    calibration = replace(calibration, vehicle={"gnss_time_offset": late})
-    for name, value in {
+    return Calibration("ok", "", {}, nothing, nothing, (), (), (), {})
+
+
+def unseen() -> LidarResult:
+    return LidarResult(gtsam.Pose3(), np.eye(6), dict.fromkeys(AXES, False), 0, saw_target=False)
+
+
+def checked(
+    calibration: Calibration, monkeypatch: pytest.MonkeyPatch, **of: object
+) -> tuple[Calibration, tuple[str, ...], tuple[str, ...]]:
+    """A calibration that is checked; `of` is what the parts of the check find."""
+    found = {
         "_between_parts": ((), ()),
-        "ranked_suspects": (suspect,),
+        "ranked_suspects": (),
         "cloud_counts": (),
         "registration_sigma": None,
         "assumptions": (),
         "typical_speed": 1.0,
         "strains": (),
-    }.items():
+    }
+    for name, value in (found | of).items():
         monkeypatch.setattr(checks, name, lambda *_, value=value: value)
     solution = cast("Solution", SimpleNamespace(registration_scale=1.0, range_bias_m=0.0))
     config = cast("Config", None)  # of the suspects
-    _, warnings = checks.check(calibration, solution, [], [], {}, config)
-    assert any("correct the clock" in warning for warning in warnings) == said
+    return checks.check(calibration, solution, [], [], {}, config)

@@ -32,6 +32,10 @@ _COPIED_S = 1e-5
 _FAR_S = 1.0
 """Seconds between stamps and record times from which they are of different clocks."""
 
+_LEAST_SEEN = 0.5
+"""Of the time between two clouds: from there on, the rest may be a part of the sweep in which the
+beams hit nothing. What is shorter is a LiDAR that pauses, or a recorder that drops clouds."""
+
 _PERIOD_TOLERANCE = 1.02
 """A sweep takes at most so much of the time between two clouds: what takes longer is damaged."""
 
@@ -73,7 +77,11 @@ def sweep_span(spans_s: Sequence[tuple[float, float]], period_s: float | None) -
 
 
 def stamp_mark(
-    setting: StampSetting, span_s: Array | None, is_absolute: bool, delays_s: Array
+    setting: StampSetting,
+    span_s: Array | None,
+    is_absolute: bool,
+    delays_s: Array,
+    period_s: float | None = None,
 ) -> StampMark:
     """What stamps mark, from the config or, with `auto`, from the data.
 
@@ -83,6 +91,7 @@ def stamp_mark(
         is_absolute: the times of the points are not relative to the stamp.
         delays_s: (n,) record time minus stamp of each cloud that has a stamp; empty: none has one,
             and the record time stands in.
+        period_s: usual time between two clouds; None: not known.
     """
     if span_s is None or span_s[1] - span_s[0] < INSTANT_S:
         return StampMark("end" if setting == "end" else "start")
@@ -94,11 +103,12 @@ def stamp_mark(
     if is_absolute or first_s < -_SLACK_S:
         # Signed and absolute times say themselves where they belong.
         return StampMark("end" if last_s < -first_s else "start", "times")
-    return _told_by_records(last_s, delays_s)
+    whole = period_s is not None and last_s < period_s < last_s / _LEAST_SEEN
+    return _told_by_records(last_s, period_s if whole and period_s else last_s, delays_s)
 
 
-def _told_by_records(last_s: float, delays_s: Array) -> StampMark:
-    """Of times that run from the stamp to `last_s` after it.
+def _told_by_records(last_s: float, sweep_s: float, delays_s: Array) -> StampMark:
+    """Of times that run from the stamp to `last_s` after it, in a sweep of `sweep_s`.
 
     The quickest cloud counts: others waited. Half a sweep is more than transport takes, and a
     quarter more than clocks of one vehicle that are set by each other differ.
@@ -113,7 +123,7 @@ def _told_by_records(last_s: float, delays_s: Array) -> StampMark:
             "taken for the end of the sweep",
         )
     least_s = float(delays_s.min())
-    if 0.75 * last_s <= least_s <= 1.5 * last_s:
+    if 0.75 * last_s <= least_s <= 1.5 * sweep_s:
         return StampMark("start", "records")
     if -0.25 * last_s <= least_s <= 0.5 * last_s and np.ptp(delays_s) + abs(least_s) > _COPIED_S:
         return StampMark(

@@ -166,7 +166,7 @@ def mark_of_clouds(
     if problem:
         return StampMark("end" if setting == "end" else "start", time_problem=problem)
     is_absolute = field is not None and field.unit.endswith("absolute")
-    return stamp_mark(setting, sweep_span(spans, period_s), is_absolute, delays_s)
+    return stamp_mark(setting, sweep_span(spans, period_s), is_absolute, delays_s, period_s)
 
 
 def _span_problem(

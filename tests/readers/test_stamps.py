@@ -37,6 +37,24 @@ def test_the_record_times_tell_what_the_stamp_marks(
     assert bool(mark.note) == (told_by == "nothing" or marks == "end")
 
 
+@pytest.mark.parametrize(
+    ("last_s", "least_s", "marks", "told_by"),
+    [
+        (0.067, 0.103, "start", "records"),  # the last third of the sweep has no returns
+        (0.067, 0.003, "end", "records"),
+        (0.067, 0.200, "start", "nothing"),
+        (0.020, 0.103, "start", "nothing"),  # no third of a sweep, but a LiDAR that pauses
+    ],
+)
+def test_a_sweep_that_ends_in_the_sky_is_as_long_as_the_time_between_clouds(
+    last_s: float, least_s: float, marks: str, told_by: str
+) -> None:
+    mark = stamp_mark("auto", np.array([0.0, last_s]), False, delays(least_s), 0.1)
+
+    assert (mark.marks, mark.told_by) == (marks, told_by)
+    assert bool(mark.note) == ((marks, told_by) != ("start", "records"))
+
+
 def test_record_times_that_are_copies_of_the_stamps_tell_nothing() -> None:
     mark = stamp_mark("auto", SWEEP, False, np.zeros(40))
 

@@ -11,8 +11,9 @@ import pytest
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
-from caliv_graph.config.model import Config
+from caliv_graph.config.model import Config, TargetRegion
 from caliv_graph.config.mounting import PoseConfig
+from caliv_graph.errors import TargetError
 from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Array
 from caliv_graph.results.run import CalibrationRun
@@ -157,6 +158,14 @@ def test_a_person_is_told() -> None:
     (line,) = (w for w in unshared().calibration.warnings if "moved" in w)
     assert "2 places" in line
     assert "No placement is shared, so S2S is unobservable: put it where two LiDARs see it" in line
+
+
+def test_a_vehicle_that_stands_where_no_target_is_is_told_to_drive() -> None:
+    drive = standing(IN_BOTH_VIEWS[0])
+    region = TargetRegion(min=(60.0, 60.0, -1.0), max=(62.0, 62.0, 2.0))
+    config = drive.config.model_copy(update={"target": (region,)})
+    with pytest.raises(TargetError, match=r"The vehicle stands: it moves 0\.0\d m .* in 5\.0 s"):
+        calibrate([drive.recording], config, SilentProgress())
 
 
 def test_a_chair_that_nobody_moves_is_one_placement() -> None:

@@ -28,6 +28,7 @@ from caliv_graph.physics import (
     with_cause,
 )
 from caliv_graph.pipeline.mistakes import mistakes, without_remedies
+from caliv_graph.pipeline.standing import with_standing
 from caliv_graph.products import (
     Finding,
     GroundObservation,
@@ -336,6 +337,9 @@ def _with_cause(
     found, raw = findings
     causes = (*found, *heading_findings(trajectories, motions, config, raw))
     if isinstance(error, TargetError) and not causes:
+        stood = with_standing(error, trajectories)
+        if stood is not None:
+            return stood
         said = _doubts_about_motion(trajectories, motions, config)
         if said:
             return TargetError(error.what, said)

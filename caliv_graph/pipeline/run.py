@@ -35,6 +35,7 @@ from caliv_graph.physics import (
 )
 from caliv_graph.pipeline.mistakes import mistakes
 from caliv_graph.pipeline.preparation import Prepared, motions_of, prepare
+from caliv_graph.pipeline.standing import with_standing
 from caliv_graph.products import (
     Calibration,
     MotionData,
@@ -234,7 +235,7 @@ def structure_evidence(prepared: Prepared) -> StructureEvidence:
 def without_anything(prepared: Prepared, error: TargetError) -> TargetError:
     """The error of drives of which structure tells nothing; with why there is no target."""
     if prepared.no_target is None:
-        return error
+        return with_standing(error, prepared.trajectories) or error
     return TargetError(nothing_sentence(str(prepared.no_target), error.what))
 
 

@@ -23,6 +23,15 @@ def nothing_sentence(what: str, structure: str) -> str:
     return f"{what}. Structure does not replace it: {structure}"
 
 
+def standing_sentence(moved_m: float, turned_deg: float, lasts_s: float) -> str:
+    """What to do where a vehicle stood: how far it moved and turned, and in how long, at most."""
+    return (
+        f"The vehicle stands: it moves {moved_m:.2f} m and turns {turned_deg:.1f} degrees in "
+        f"{lasts_s:.1f} s. Record a drive past the target or walls, or, of LiDARs with a common "
+        "view, a target that is carried to several places"
+    )
+
+
 def rough_ground_sentence(drive: str, roughness_m: float, sigma_m: float, used_m: float) -> str:
     """The warning that the ground seen may not be what carries the wheels; sigmas of the height."""
     return (

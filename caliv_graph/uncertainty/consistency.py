@@ -16,6 +16,7 @@ from scipy.special import bdtrc, chdtrc, ndtr
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
+from caliv_graph.mounting.mirror import are_mirror_images
 from caliv_graph.products import Array, Guess, LidarResult
 from caliv_graph.trajectory.heading import HeadingSource
 from caliv_graph.uncertainty.observability import UNIT, scaling
@@ -246,6 +247,7 @@ class GuessContradiction:
         late_s: lateness of stamps (negative: early) that gives the same offset; None if a clock
             does not explain it.
         speed_m_s: of the vehicle.
+        mirrored: whether the guess mirrors that of `swapped_with`: left and right are exchanged.
     """
 
     lidar: str
@@ -256,6 +258,7 @@ class GuessContradiction:
     swapped_with: str | None
     late_s: float | None
     speed_m_s: float
+    mirrored: bool = False
 
 
 @dataclass(frozen=True)
@@ -342,15 +345,21 @@ def against_guesses(
         determined = np.array([lidar.determined[axis] for axis in AXES])
         wrong = np.flatnonzero(determined & (np.abs(off) > CONTRADICTION_SIGMAS * sigma)).tolist()
         if wrong:
+            swapped = _swapped_with(name, lidars)
+            other = lidars[swapped].guess if swapped is not None else None
             yield GuessContradiction(
                 lidar=name,
                 guess=guess,
                 difference=off,
                 sigma=sigma,
                 axes=tuple(sorted(wrong, key=lambda i: -abs(off[i]) / sigma[i])),
-                swapped_with=_swapped_with(name, lidars),
+                swapped_with=swapped,
                 late_s=_late_s(off, wrong, speed_m_s),
                 speed_m_s=speed_m_s,
+                mirrored=other is not None
+                and are_mirror_images(
+                    (guess.T_vehicle_lidar, other.T_vehicle_lidar), (guess.sigmas, other.sigmas)
+                ),
             )
 
 

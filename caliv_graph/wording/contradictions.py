@@ -28,6 +28,7 @@ from caliv_graph.uncertainty.consistency import (
     lateness,
     p_value,
 )
+from caliv_graph.wording.mounting import WITH_Y_LEFT
 
 MOST_OF = 0.75
 """Fraction of the outliers that lie in one part of the drive from which that part is named."""
@@ -98,9 +99,10 @@ def _guess(found: GuessContradiction) -> str:
 def _guess_remedy(found: GuessContradiction) -> str:
     """The likely mistake, and what to check."""
     if found.swapped_with is not None:
+        sides = f", or y counts to the right there: {WITH_Y_LEFT} then" if found.mirrored else ""
         return (
             f"The estimate agrees with the guess of '{found.swapped_with}': check whether their "
-            "topics are swapped"
+            f"topics are swapped{sides}"
         )
     if found.late_s is not None:
         way = "late" if found.late_s > 0.0 else "early"

@@ -10,8 +10,12 @@ import numpy as np
 
 from caliv_graph.config.model import Config
 from caliv_graph.mounting.doubts import Doubt, turned_over
+from caliv_graph.mounting.mirror import are_mirror_images
 from caliv_graph.mounting.place import Placement
 from caliv_graph.mounting.sharpness import CELLS_M
+
+WITH_Y_LEFT = "change the sign of y, pitch and yaw of all guesses"
+"""Of guesses on a vehicle with x forward, y right, z down."""
 
 MOST_OTHERS = 2
 """Other mountings that are listed."""
@@ -79,11 +83,12 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
     names = [f"'{name}'" for name in found.lidars]
     if found.kind == "exchanged":
         a, b = found.lidars
-        return (
-            f"the topics of lidars {names[0]} and {names[1]} are swapped",
-            "With the initial guess of the other one",
-            f"Exchange lidars.{a}.topic and lidars.{b}.topic",
-        )
+        what = f"the topics of lidars {names[0]} and {names[1]} are swapped"
+        remedy = f"Exchange lidars.{a}.topic and lidars.{b}.topic"
+        if _mirror_each_other(a, b, config):
+            what += ", or y of both guesses counts to the right, for they mirror each other"
+            remedy += f"; or, with y to the right in the guesses, {WITH_Y_LEFT}"
+        return what, "With the initial guess of the other one", remedy
     if found.kind == "turned":
         (name,) = found.lidars
         roll, pitch, yaw = config.lidars[name].given.rpy_deg
@@ -118,6 +123,12 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
         "With one of them mirrored",
         f"{remedy}; or, if the poses are right, write the points with y to the left",
     )
+
+
+def _mirror_each_other(a: str, b: str, config: Config) -> bool:
+    one, other = config.lidars[a], config.lidars[b]
+    guesses, sigmas = (one.guess(), other.guess()), (one.sigma.sigmas(), other.sigma.sigmas())
+    return are_mirror_images(guesses, sigmas)
 
 
 def _turn(found: Doubt) -> str:

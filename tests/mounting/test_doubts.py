@@ -61,6 +61,25 @@ def test_topics_that_are_swapped() -> None:
     text = mistake_sentence(doubt, config)
     assert "the topics of lidars 'front' and 'rear' are swapped" in text
     assert "Exchange lidars.front.topic and lidars.rear.topic" in text
+    assert "y of both guesses" not in text  # front and rear do not mirror each other
+
+
+def test_swapped_topics_of_a_symmetric_rig_may_be_guesses_with_y_to_the_right() -> None:
+    """Of a vehicle with x forward, y right, z down: y, pitch and yaw have the other sign."""
+    guesses = {
+        name: gtsam.Pose3(
+            gtsam.Rot3.RzRyRx(0.0, -0.17, math.radians(side * 40.0)),
+            np.array([1.2, side * 0.6, 1.8]),
+        )
+        for name, side in (("left", -1.0), ("right", 1.0))
+    }
+    config = config_of(**guesses)
+    sharing = {"left": (1.0, 4.0), "right": (1.1, 4.2)}
+    text = mistake_sentence(
+        Doubt(0, "drive", "exchanged", ("left", "right"), 0, sharing, False), config
+    )
+    assert "the topics of lidars 'left' and 'right' are swapped, or y of both guesses" in text
+    assert "change the sign of y, pitch and yaw of all guesses" in text
 
 
 @pytest.mark.parametrize("degrees", [180.0, -90.0])

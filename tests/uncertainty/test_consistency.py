@@ -36,6 +36,7 @@ from caliv_graph.uncertainty.consistency import (
     p_value,
     too_many_outliers,
 )
+from caliv_graph.wording.contradictions import contradiction_sentence
 from tests.samples import MOUNTINGS, pose
 
 GUESS_SIGMAS = np.array([0.03] * 3 + [0.058] * 3)
@@ -131,6 +132,20 @@ def test_swapped_topics_are_found() -> None:
         lidar = result(guess, np.zeros(6))
         lidars[name] = LidarResult(found, lidar.cov, ALL, 80, True, guess=lidar.guess)
     assert [found.swapped_with for found in against_guesses(lidars)] == ["rear", "front"]
+    assert not any(found.mirrored for found in against_guesses(lidars))
+
+
+def test_swapped_guesses_of_either_side_mirror_each_other() -> None:
+    """Topics that are swapped, or y to the right: the estimates do not tell which."""
+    left = pose((1.2, 0.6, 1.8), (0.0, 3.0, 40.0))
+    right = pose((1.23, -0.57, 1.77), (2.0, 1.0, -42.0))
+    lidars = {}
+    for name, guess, found in (("left", right, left), ("right", left, right)):
+        lidar = result(guess, np.zeros(6))
+        lidars[name] = LidarResult(found, lidar.cov, ALL, 80, True, guess=lidar.guess)
+    contradictions = [*against_guesses(lidars)]
+    assert [found.mirrored for found in contradictions] == [True, True]
+    assert "y counts to the right" in contradiction_sentence(contradictions[0])
 
 
 # ------------------------------------------------------------------ clouds

@@ -21,7 +21,7 @@ from caliv_graph.products import (
 )
 from caliv_graph.targets.cloud.copies import copies
 from caliv_graph.targets.ground.guesses import lidar_grounds, misfits
-from caliv_graph.trajectory.given_physics import poses_physics
+from caliv_graph.trajectory.given_physics import impossible_speed, poses_physics
 from caliv_graph.trajectory.heading import heading_disagreement
 from caliv_graph.trajectory.physics import motion_physics
 from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses
@@ -30,6 +30,7 @@ from caliv_graph.trajectory.tilt import vehicle_tilt
 from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
 from caliv_graph.wording.physics import (
     copies_sentence,
+    fast_finding,
     guess_findings,
     heading_finding,
     motion_findings,
@@ -51,9 +52,12 @@ def raw_findings(motions: Mapping[int, MotionData], config: Config) -> tuple[Fin
     out: list[Finding] = []
     for motion in motions.values():
         if takes_given_poses(motion, config):
-            poses = poses_physics(motion)
+            # Far from the map's origin, poses that are inverted are fast, too.
+            poses, speed_m_s = poses_physics(motion), impossible_speed(motion)
             if poses is not None:
                 out.append(poses_finding(poses, config))
+            elif speed_m_s is not None:
+                out.append(fast_finding(motion.name, speed_m_s, config))
             continue
         try:
             found = motion_physics(motion, config)

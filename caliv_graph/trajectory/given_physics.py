@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, MotionData
 from caliv_graph.trajectory.odometry import OdometryPoses
@@ -35,6 +36,13 @@ STEP_M = 1.0
 
 MIN_STEPS = 8
 """Pieces of the way that tell a course."""
+
+MAX_SPEED_M_S = 70.0
+"""250 km/h: no vehicle is calibrated that fast. Centimetres or millimetres that are read as metres
+make a walking pace faster."""
+
+SPEED_WINDOW_NS = 1_000_000_000
+"""Time over which the speed is taken: noise of decimetres is none."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +145,22 @@ def poses_physics(motion: MotionData) -> PosesPhysics | None:
     best = min(then.spread_rad for then in sound.values())
     alike = {n: s for n, s in sound.items() if s.spread_rad <= best + MIN_SPREAD_RAD * MENDED}
     return PosesPhysics(motion.name, now, tuple(alike), next(iter(alike.values())))
+
+
+def impossible_speed(motion: MotionData) -> float | None:
+    """Median speed of a vehicle by given poses, m/s, if no vehicle goes as fast; None: it may."""
+    poses = motion.poses
+    if poses is None or isinstance(poses, OdometryPoses) or len(poses.stamps_ns) < MIN_STEPS:
+        return None
+    _, t = stack(poses.T_map_vehicle)
+    after = np.searchsorted(poses.stamps_ns, poses.stamps_ns + SPEED_WINDOW_NS)
+    before = np.flatnonzero(after < len(t))
+    if len(before) < MIN_STEPS:
+        return None
+    after = after[before]
+    seconds = (poses.stamps_ns[after] - poses.stamps_ns[before]) / NANOSECONDS_PER_SECOND
+    speed = float(np.median(np.linalg.norm(t[after] - t[before], axis=1) / seconds))
+    return speed if speed > MAX_SPEED_M_S else None
 
 
 def stance(R_map_vehicle: Array, t_map_vehicle: Array) -> Stance:

@@ -18,6 +18,7 @@ from caliv_graph.trajectory.alignment import level
 from caliv_graph.trajectory.axes import Axes
 from caliv_graph.trajectory.given_physics import (
     MAX_OFF_RAD,
+    MAX_SPEED_M_S,
     MAX_TILT_RAD,
     MIN_SPREAD_RAD,
     PosesPhysics,
@@ -340,6 +341,23 @@ _READINGS = {
     "xy": ("with x and y exchanged", "Exchange them: east is x, and north is y"),
 }
 """How given poses are read (`trajectory.given_physics.READINGS`), and what to do."""
+
+
+def fast_finding(name: str, speed_m_s: float, config: Config) -> Finding:
+    """Given poses that are as fast as no vehicle is: positions are in another unit."""
+    where = "input/ego_poses.yaml" if config.data.format == "caliv" else pose_key(config)
+    sigma = MAX_SPEED_M_S / CONTRADICTION_SIGMAS
+    return Finding(
+        "topics.pose",
+        (),
+        sigma,
+        speed_m_s / sigma,
+        "fatal",
+        f"{name}: by the poses in {where}, the vehicle goes {speed_m_s:.0f} m/s (median; "
+        f"{MAX_SPEED_M_S:g} at most). Give positions in metres (of centimetres it would be "
+        f"{0.01 * speed_m_s:.2g} m/s, of millimetres {0.001 * speed_m_s:.2g}), and check the unit "
+        "of their stamps",
+    )
 
 
 def poses_finding(found: PosesPhysics, config: Config) -> Finding:

@@ -18,6 +18,7 @@ from caliv_graph.trajectory.given_physics import PosesPhysics, poses_physics
 
 NORTH_EAST = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 DOWN = np.diag([1.0, -1.0, -1.0])
+CONFIG = {"lidars": {"a": {"topic": "/a"}}, "topics": {"pose": "/pose"}}
 
 
 def s_curve(radius_m: float = 9.0, ahead_m: float = 0.0) -> tuple[Array, Array]:
@@ -95,7 +96,7 @@ def test_poses_of_another_convention_stop_with_what_they_are(reading: str) -> No
     assert physics is not None
     assert reading in physics.readings
     assert math.degrees(physics.then.spread_rad) < 1.0
-    config = Config.model_validate({"lidars": {"a": {"topic": "/a"}}, "topics": {"pose": "/pose"}})
+    config = Config.model_validate(CONFIG)
     findings = raw_findings({0: recorded(R, t)}, config)
     with pytest.raises(TrajectoryError, match=r"drive: by the poses in topics.pose, .*median"):
         raise_fatal(findings)
@@ -118,3 +119,20 @@ def test_a_frame_with_z_down_is_a_warning() -> None:
     assert finding.severity == "warning"
     assert "z of the vehicle is 177 degrees from z of the map" in finding.sentence
     assert "data.pose_axes: frd" in finding.sentence
+
+
+def test_positions_in_millimetres_make_a_vehicle_that_is_too_fast() -> None:
+    R, t = s_curve()  # at 2 m/s
+    assert raw_findings({0: recorded(R, t)}, Config.model_validate(CONFIG)) == ()
+    (fast,) = raw_findings({0: recorded(R, 1000.0 * t)}, Config.model_validate(CONFIG))
+    assert "the vehicle goes 1998 m/s" in fast.sentence
+    assert "of millimetres 2)" in fast.sentence
+    with pytest.raises(TrajectoryError, match="Give positions in metres"):
+        raise_fatal([fast])
+
+
+def test_poses_that_are_inverted_far_from_the_origin_are_not_in_another_unit() -> None:
+    R, t = s_curve()
+    poses = [gtsam.Pose3(gtsam.Rot3(a), 5.0 * b).inverse() for a, b in zip(R, t, strict=True)]
+    (found,) = raw_findings({0: recorded(*stack(poses))}, Config.model_validate(CONFIG))
+    assert "Invert them" in found.sentence

@@ -28,7 +28,8 @@ from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.pipeline import calibrate
-from caliv_graph.products import Array, LidarScan
+from caliv_graph.pipeline.run import _blamed
+from caliv_graph.products import Array, LidarScan, Suspect
 from caliv_graph.readers import open_recording
 from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.results.run import CalibrationRun
@@ -558,6 +559,32 @@ class EveryThird(ForwardingRecording):
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         third = self.scan_stamps_ns(lidar)
         return super().scans(lidar, {s for s in third if wanted is None or s in wanted})
+
+
+@pytest.mark.parametrize(
+    ("first", "sigmas", "concerned", "blamed"),
+    [
+        ("lidars.front.initial", 8.0, (), ("front",)),
+        ("lidars.front.initial", 8.0, ("rear",), ("front", "rear")),
+        ("imu.T_vehicle_imu", 8.0, ("rear",), None),  # the path itself is wrong
+        ("poses.drift", 8.0, (), ()),  # takes up a part of left-handed clouds, too
+        ("gnss.drift.0", 8.0, ("rear",), ("rear",)),
+        ("imu.T_vehicle_imu", 2.0, ("rear",), ("rear",)),
+        ("imu.T_vehicle_imu", 2.0, (), None),
+    ],
+)
+def test_mistakes_of_guesses_are_looked_for_unless_the_motion_is_wrong(
+    quiet: list[Tried],
+    first: str,
+    sigmas: float,
+    concerned: tuple[str, ...],
+    blamed: tuple[str, ...] | None,
+) -> None:
+    suspect = Suspect(first, (1.0,), (0.1,), (1.0,), ("m",), 0.9, sigmas, sigmas)
+    sound = quiet[0].run.calibration
+    wrong = replace(sound, status="inconsistent", suspects=(suspect,))
+    assert _blamed(wrong, concerned) == blamed
+    assert _blamed(replace(wrong, status="ok"), concerned) is None
 
 
 @pytest.mark.skipif(not RELEASED.is_dir(), reason=f"the authors' drive is not at {RELEASED.name}")

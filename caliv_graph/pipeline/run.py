@@ -176,7 +176,8 @@ def _calibrated(
         clocks = clock_findings(names, solution.structure, calibration)
         findings = (*prepared.findings, *clocks)
         said, unread = prepared.mistakes, ""
-        if not said and prior is None and (blamed := _blamed(calibration, concerned)):
+        blamed = _blamed(calibration, concerned)
+        if not said and prior is None and blamed is not None:
             raw, smoothed = raw_findings(motions, guessed), prepared.trajectories
             try:
                 found = mistakes(
@@ -209,22 +210,23 @@ def _calibrated(
     return run, bool(said)
 
 
-def _blamed(calibration: Calibration, concerned: Sequence[str]) -> tuple[str, ...]:
-    """LiDARs whose guess may be contradicted; none if an input of the motion explains more.
+def _blamed(calibration: Calibration, concerned: Sequence[str]) -> tuple[str, ...] | None:
+    """LiDARs whose guess may be contradicted; None: no mistake of a guess is to be looked for.
 
-    `concerned` are those that contradictions of the solve are about.
+    It is not where an input of the motion explains more. A drift is no such input: it takes up a
+    part of whatever is wrong. `concerned` are LiDARs that contradictions of the solve are about.
     """
     if calibration.status != "inconsistent":
-        return ()
-    first = calibration.suspects[:1]
-    if any(s.sigmas > CONTRADICTION_SIGMAS and not s.input.endswith(".initial") for s in first):
-        return ()
-    leading = {s.input for s in first if s.sigmas > CONTRADICTION_SIGMAS}
-    return tuple(
+        return None
+    leading = {s.input for s in calibration.suspects[:1] if s.sigmas > CONTRADICTION_SIGMAS}
+    if any(not key.endswith(".initial") and ".drift" not in key for key in leading):
+        return None
+    blamed = tuple(
         name
         for name in calibration.lidars
         if f"lidars.{name}.initial" in leading or name in concerned
     )
+    return blamed if blamed or leading else None
 
 
 def structure_evidence(prepared: Prepared) -> StructureEvidence:

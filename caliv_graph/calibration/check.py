@@ -37,6 +37,7 @@ from caliv_graph.uncertainty.consistency import (
     CoarseRegistrations,
     Contradiction,
     GuessContradiction,
+    GuessesTogether,
     RangesDisagree,
     ScoreTest,
     Strain,
@@ -118,7 +119,10 @@ def check(
     leads = bool(suspects) and suspects[0].sigmas > consistency.CONTRADICTION_SIGMAS
     if leads:
         found = unexplained(found, suspects)
-    sentences = [ranking_sentence(suspects)] if leads else []
+    # Of guesses that are off together none is more likely wrong than the others.
+    of_all = any(isinstance(each, GuessesTogether) for each in found)
+    one = leads and not (of_all and suspects[0].input.endswith(".initial"))
+    sentences = [ranking_sentence(suspects)] if one else []
     sentences += [contradiction_sentence(each, leads) for each in found]
     if sentences:
         calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))
@@ -143,7 +147,7 @@ def _about(found: Contradiction) -> tuple[str, ...]:
             return (found.lidar, other)
         case GuessContradiction() | CloudCount() | ScoreTest():
             return (found.lidar,)
-        case CoarseRegistrations() | RangesDisagree():
+        case CoarseRegistrations() | RangesDisagree() | GuessesTogether():
             return found.lidars
         case _:
             return ()
@@ -176,6 +180,11 @@ def unexplained(
         match each:
             case GuessContradiction():
                 name = f"lidars.{each.lidar}.initial"
+            case GuessesTogether():
+                inputs = [f"lidars.{lidar}.initial" for lidar in each.lidars]
+                return suspects[0].input in inputs or any(
+                    left.get(name, math.inf) > consistency.CONTRADICTION_SIGMAS for name in inputs
+                )
             case ScoreTest(kind="clock"):
                 name = f"lidars.{each.lidar}.time_offset"
             case ScoreTest(kind="halves" | "turns"):

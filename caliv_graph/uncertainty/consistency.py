@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import gtsam
 import numpy as np
 from scipy.special import bdtrc, chdtrc, ndtr
 
@@ -23,6 +24,13 @@ from caliv_graph.uncertainty.observability import UNIT, scaling
 
 CONTRADICTION_SIGMAS = 5.0
 """Of a normal variable: the limit of every test."""
+
+TOGETHER_SIGMAS = 3.0
+"""Of differences from guesses: what is beyond is no chance, what is below may be."""
+
+IN_FRAME = np.array([math.radians(0.5)] * 3 + [0.03] * 3)
+"""Difference from a frame up to which a LiDAR is at it, rad and m: what a drive leaves open. No
+LiDAR is where another is, or turned as exactly as the vehicle frame and in its origin."""
 
 CONTRADICTION_P = float(2.0 * ndtr(-CONTRADICTION_SIGMAS))
 """Probability of a false alarm, per test: 5.7e-7."""
@@ -234,6 +242,13 @@ class CheckInputs:
 
 
 @dataclass(frozen=True)
+class Frame:
+    """A frame that clouds may be in: of a LiDAR, or of the vehicle (None)."""
+
+    lidar: str | None
+
+
+@dataclass(frozen=True)
 class GuessContradiction:
     """An estimate that is too far from its initial guess.
 
@@ -248,6 +263,8 @@ class GuessContradiction:
             does not explain it.
         speed_m_s: of the vehicle.
         mirrored: whether the guess mirrors that of `swapped_with`: left and right are exchanged.
+        frame: the frame that the estimate is at, where no LiDAR is: "vehicle", or that of another
+            LiDAR; None: of its own. The clouds are in that frame already.
     """
 
     lidar: str
@@ -259,6 +276,26 @@ class GuessContradiction:
     late_s: float | None
     speed_m_s: float
     mirrored: bool = False
+    frame: Frame | None = None
+
+
+@dataclass(frozen=True)
+class GuessesTogether:
+    """Guesses of all LiDARs that are off by one motion of the vehicle frame.
+
+    Attributes:
+        lidars: all that have a guess.
+        T_vehicle_guessed: the frame of the guesses: with it, all of them fit.
+        sigmas: of the largest difference of an estimate from its guess.
+        late_s: as of `GuessContradiction`, the median of those that are contradicted.
+        speed_m_s: of the vehicle.
+    """
+
+    lidars: tuple[str, ...]
+    T_vehicle_guessed: gtsam.Pose3
+    sigmas: float
+    late_s: float | None
+    speed_m_s: float
 
 
 @dataclass(frozen=True)
@@ -294,6 +331,7 @@ class RangesDisagree:
 
 Contradiction = (
     GuessContradiction
+    | GuessesTogether
     | CloudCount
     | CoarseRegistrations
     | RangesDisagree
@@ -308,7 +346,7 @@ Contradiction = (
 def contradictions(inputs: CheckInputs) -> tuple[Contradiction, ...]:
     """All tests: what contradicts what; empty if nothing is wrong."""
     return (
-        *against_guesses(inputs.lidars, inputs.speed_m_s),
+        *together(tuple(against_guesses(inputs.lidars, inputs.speed_m_s)), inputs.lidars),
         *(count for count in inputs.counts if too_many_outliers(count)),
         *coarse_registrations(inputs),
         *disagreeing_ranges(inputs),
@@ -335,13 +373,9 @@ def against_guesses(
     that are trusted or saw nothing are not tested. `speed_m_s` says how late stamps would have to
     be.
     """
-    for name, lidar in lidars.items():
-        guess = lidar.guess
-        if guess is None or guess.fixed or guess.found or not lidar.has_data:
-            continue
+    for name, (lidar, guess) in _tested(lidars).items():
         off = vehicle_axes_difference(lidar.T_vehicle_lidar, guess.T_vehicle_lidar)
-        Q = right_to_vehicle_axes(lidar.T_vehicle_lidar)
-        sigma = np.sqrt(np.diag(Q @ lidar.cov @ Q.T) + guess.sigmas**2)
+        sigma = _sigmas(lidar, guess)
         determined = np.array([lidar.determined[axis] for axis in AXES])
         wrong = np.flatnonzero(determined & (np.abs(off) > CONTRADICTION_SIGMAS * sigma)).tolist()
         if wrong:
@@ -356,11 +390,76 @@ def against_guesses(
                 swapped_with=swapped,
                 late_s=_late_s(off, wrong, speed_m_s),
                 speed_m_s=speed_m_s,
+                frame=_already_in(name, lidars),
                 mirrored=other is not None
                 and are_mirror_images(
                     (guess.T_vehicle_lidar, other.T_vehicle_lidar), (guess.sigmas, other.sigmas)
                 ),
             )
+
+
+def _tested(lidars: Mapping[str, LidarResult]) -> dict[str, tuple[LidarResult, Guess]]:
+    """LiDARs that saw something and whose guess a user gave, but does not trust; and the guess."""
+    return {
+        name: (lidar, guess)
+        for name, lidar in lidars.items()
+        if (guess := lidar.guess) and not guess.fixed and not guess.found and lidar.has_data
+    }
+
+
+def _sigmas(lidar: LidarResult, guess: Guess) -> Array:
+    """(6,) of the difference of estimate and guess, vehicle axes, rad and m."""
+    Q = right_to_vehicle_axes(lidar.T_vehicle_lidar)
+    return np.asarray(np.sqrt(np.diag(Q @ lidar.cov @ Q.T) + guess.sigmas**2))
+
+
+def _already_in(name: str, lidars: Mapping[str, LidarResult]) -> Frame | None:
+    """The frame in which the clouds of a LiDAR are, by where it was found."""
+    others = [(Frame(other), of.T_vehicle_lidar) for other, of in lidars.items() if other != name]
+    lidar = lidars[name]
+    told = np.array([lidar.determined[axis] for axis in AXES])
+    if not told[:3].all() or not told[3:].any():
+        return None
+    for frame, T in ((Frame(None), gtsam.Pose3()), *others):
+        off = np.abs(vehicle_axes_difference(lidar.T_vehicle_lidar, T))
+        if (off < IN_FRAME)[told].all():
+            return frame
+    return None
+
+
+def together(
+    found: Sequence[GuessContradiction], lidars: Mapping[str, LidarResult]
+) -> tuple[GuessContradiction | GuessesTogether, ...]:
+    """The findings; one in their place if a motion of the vehicle frame explains all guesses.
+
+    Not where one LiDAR is at the guess of another, nor where some guess is right as it is.
+    """
+    tested = _tested(lidars)
+    if not found or len(tested) < 2 or any(each.swapped_with is not None for each in found):
+        return tuple(found)
+    moves = [
+        lidar.T_vehicle_lidar.compose(guess.T_vehicle_lidar.inverse())
+        for lidar, guess in tested.values()
+    ]
+    mean = np.mean([gtsam.Pose3.Logmap(moves[0].between(T)) for T in moves], axis=0)
+    T_vehicle_guessed = moves[0].compose(gtsam.Pose3.Expmap(mean))
+    as_given = [_most_sigmas(*of, gtsam.Pose3()) for of in tested.values()]
+    moved = [_most_sigmas(*of, T_vehicle_guessed) for of in tested.values()]
+    if min(as_given) < TOGETHER_SIGMAS or max(moved) > TOGETHER_SIGMAS:
+        return tuple(found)
+    late = [each.late_s for each in found if each.late_s is not None]
+    late_s = float(np.median(late)) if len(late) == len(found) else None
+    speed_m_s = found[0].speed_m_s
+    return (GuessesTogether(tuple(tested), T_vehicle_guessed, max(as_given), late_s, speed_m_s),)
+
+
+def _most_sigmas(lidar: LidarResult, guess: Guess, T_vehicle_guessed: gtsam.Pose3) -> float:
+    """Of the determined axes, the largest difference of an estimate from a guess that is moved."""
+    moved = T_vehicle_guessed.compose(guess.T_vehicle_lidar)
+    off = np.abs(vehicle_axes_difference(lidar.T_vehicle_lidar, moved)) / _sigmas(lidar, guess)
+    return max(
+        (float(off[i]) for i, axis in enumerate(AXES) if lidar.determined[axis]), default=0.0
+    )
 
 
 def _swapped_with(name: str, lidars: Mapping[str, LidarResult]) -> str | None:

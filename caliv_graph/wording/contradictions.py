@@ -20,6 +20,7 @@ from caliv_graph.uncertainty.consistency import (
     CoarseRegistrations,
     Contradiction,
     GuessContradiction,
+    GuessesTogether,
     Heading,
     RangesDisagree,
     ScoreTest,
@@ -42,6 +43,8 @@ def contradiction_sentence(found: Contradiction, led: bool = False) -> str:
     match found:
         case GuessContradiction():
             return _guess(found)
+        case GuessesTogether():
+            return _together(found)
         case CloudCount():
             return (
                 f"{outliers_text(found)}; an outlier ratio of {OUTLIERS:.0%} does not explain that "
@@ -96,6 +99,28 @@ def _guess(found: GuessContradiction) -> str:
     return f"lidar '{found.lidar}': {'; '.join(parts)}. {_guess_remedy(found)}"
 
 
+def _together(found: GuessesTogether) -> str:
+    names = " and ".join(f"'{name}'" for name in found.lidars)
+    moved = ", ".join(f"{value:+.2f}" for value in found.T_vehicle_guessed.translation() + 0.0)
+    turned = ", ".join(
+        f"{angle:+.1f}" for angle in np.degrees(found.T_vehicle_guessed.rotation().rpy()) + 0.0
+    )
+    late = ""
+    if found.late_s is not None:
+        way = "late" if found.late_s > 0.0 else "early"
+        late = (
+            f". Stamps of all LiDARs that are {abs(found.late_s):.2f} s {way} at "
+            f"{found.speed_m_s:.1f} m/s have this effect, too"
+        )
+    return (
+        f"lidars {names}: the initial guesses of all are off by the same ({found.sigmas:.0f} "
+        f"sigma): they fit if their vehicle frame is moved by ({moved}) m and turned by ({turned}) "
+        "degrees (roll, pitch, yaw). Guesses and motion data are of different vehicle frames: "
+        "check origin and axes of the guesses, and of topics.pose or the mounts of IMU, antenna "
+        f"and wheels{late}"
+    )
+
+
 def _guess_remedy(found: GuessContradiction) -> str:
     """The likely mistake, and what to check."""
     if found.swapped_with is not None:
@@ -103,6 +128,13 @@ def _guess_remedy(found: GuessContradiction) -> str:
         return (
             f"The estimate agrees with the guess of '{found.swapped_with}': check whether their "
             f"topics are swapped{sides}"
+        )
+    if found.frame is not None:
+        of = found.frame.lidar
+        return (
+            f"The estimate is {'the vehicle frame' if of is None else f'that of {of!r}'}: the "
+            f"clouds of '{found.lidar}' are in that frame already, moved by a driver or a node. "
+            "Give its clouds as it measures them"
         )
     if found.late_s is not None:
         way = "late" if found.late_s > 0.0 else "early"

@@ -12,7 +12,11 @@ import pytest
 from scipy.stats import binom, kstest
 
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes
+from caliv_graph.geometry.se3 import (
+    retract_vehicle_axes,
+    right_to_vehicle_axes,
+    vehicle_axes_difference,
+)
 from caliv_graph.products import Array, Guess, LidarResult
 from caliv_graph.uncertainty.consistency import (
     CONTRADICTION_P,
@@ -23,6 +27,8 @@ from caliv_graph.uncertainty.consistency import (
     CheckInputs,
     CloudCount,
     CoarseRegistrations,
+    GuessContradiction,
+    GuessesTogether,
     Heading,
     ScoreTest,
     ScoreTestKind,
@@ -146,6 +152,63 @@ def test_swapped_guesses_of_either_side_mirror_each_other() -> None:
     contradictions = [*against_guesses(lidars)]
     assert [found.mirrored for found in contradictions] == [True, True]
     assert "y counts to the right" in contradiction_sentence(contradictions[0])
+
+
+def test_clouds_that_are_in_another_frame_already_are_named() -> None:
+    """Of the vehicle, height unknown, or of another LiDAR: there is no place for a second one."""
+    front, rear = pose(*MOUNTINGS["front"]), pose(*MOUNTINGS["rear"])
+    level = {**ALL, "z": False}
+    lidars = {"front": result(front, np.zeros(6)), "rear": result(rear, np.zeros(6), level)}
+    lidars["rear"] = replace(
+        lidars["rear"], T_vehicle_lidar=pose((0.01, 0.0, 2.0), (0.1, 0.0, 0.1))
+    )
+    (found,) = against_guesses(lidars)
+    assert "The estimate is the vehicle frame" in contradiction_sentence(found)
+    lidars["rear"] = replace(
+        lidars["rear"], T_vehicle_lidar=retract_vehicle_axes(front, along("x", 0.01))
+    )
+    lidars["front"] = replace(lidars["front"], guess=None)  # at its guess, topics were swapped
+    (found,) = against_guesses(lidars)
+    assert "The estimate is that of 'front': the clouds of 'rear'" in contradiction_sentence(found)
+    lidars["rear"] = replace(
+        lidars["rear"], T_vehicle_lidar=retract_vehicle_axes(front, along("x", 0.3))
+    )
+    (found,) = against_guesses(lidars)
+    assert found.frame is None
+
+
+def test_guesses_of_another_vehicle_frame_are_off_together() -> None:
+    """Those of a frame 0.8 m behind, turned by 12 degrees; errors of the guesses on top."""
+    T = pose((-0.8, 0.0, 0.0), (0.0, 0.0, 12.0))
+    lidars = {}
+    for sign, (name, mounting) in zip((1.0, -1.0, 0.5), MOUNTINGS.items(), strict=True):
+        guess = T.inverse().compose(pose(*mounting))
+        guess = retract_vehicle_axes(guess, sign * along("y", 0.05))
+        lidar = result(guess, np.zeros(6))
+        lidars[name] = replace(lidar, T_vehicle_lidar=pose(*mounting))
+    (found,) = contradictions(CheckInputs(lidars=lidars))
+    assert isinstance(found, GuessesTogether)
+    assert found.lidars == tuple(MOUNTINGS)
+    off = vehicle_axes_difference(found.T_vehicle_guessed, T)
+    assert np.abs(off).max() < 0.03
+    assert "moved by (-0.8" in contradiction_sentence(found)
+    assert "turned by (+0.0, +0.0, +12.0) degrees" in contradiction_sentence(found)
+    # One that is right as it is: then the others are off for themselves.
+    lidars["front"] = result(pose(*MOUNTINGS["front"]), np.zeros(6))
+    alone = contradictions(CheckInputs(lidars=lidars))
+    assert {each.lidar for each in alone if isinstance(each, GuessContradiction)} == {
+        "rear",
+        "left",
+    }
+
+
+def test_guesses_that_are_off_by_something_of_their_own_are_not_off_together() -> None:
+    lidars = {
+        name: result(pose(*MOUNTINGS[name]), along("x", off))
+        for name, off in (("front", 0.8), ("rear", -0.8))
+    }
+    found = contradictions(CheckInputs(lidars=lidars))
+    assert [type(each) for each in found] == [GuessContradiction] * 2
 
 
 # ------------------------------------------------------------------ clouds

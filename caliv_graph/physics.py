@@ -28,6 +28,7 @@ from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.tilt import vehicle_tilt
 from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
+from caliv_graph.wording.offsets import late_clock_sentences
 from caliv_graph.wording.physics import (
     copies_sentence,
     fast_finding,
@@ -139,6 +140,19 @@ def clock_findings(
 
     found = min(against(0.0), against(sum(inertial)), key=len)
     return found or _apart(names, terms)
+
+
+def without_effects(
+    doubts: Sequence[str], clocks: Sequence[Finding], calibration: Calibration
+) -> tuple[str, ...]:
+    """The doubts without those about clocks of the motion data, if those of LiDARs are wrong.
+
+    Where two LiDARs are 50 ms apart, the clock of the poses is estimated between theirs.
+    """
+    if not contradictions_of(clocks):
+        return tuple(doubts)
+    effects = set(late_clock_sentences(calibration.vehicle))
+    return tuple(doubt for doubt in doubts if doubt not in effects)
 
 
 def _apart(names: Sequence[str], terms: Sequence[StructureTerm]) -> tuple[Finding, ...]:

@@ -17,8 +17,10 @@ from caliv_graph.physics import (
     ranked_with,
     warnings_of,
     with_cause,
+    without_effects,
 )
 from caliv_graph.products import Finding, StructureTerm, Suspect, VehicleParameter
+from caliv_graph.wording.offsets import late_clock_sentences
 from tests.samples import make_calibration
 
 
@@ -86,6 +88,16 @@ def term(**clocks: tuple[float, float]) -> StructureTerm:
     return StructureTerm(
         0, np.zeros(0, np.int64), (), {}, {}, {}, nothing, nothing, (), 0.0, clocks=clocks
     )
+
+
+def test_where_clocks_of_lidars_are_wrong_that_of_the_poses_is_not_to_be_corrected() -> None:
+    between = VehicleParameter(np.array([-0.027]), np.array([0.0024]), (True,))
+    calibration = replace(make_calibration(), vehicle={"pose_time_offset": between})
+    doubts = ("another doubt", *late_clock_sentences(calibration.vehicle))
+    assert len(doubts) == 2
+    assert without_effects(doubts, [finding(50.0)], calibration) == ("another doubt",)
+    assert without_effects(doubts, [finding(9.0, "warning")], calibration) == doubts
+    assert without_effects(doubts, [], calibration) == doubts
 
 
 def test_a_clock_that_walls_contradict_leads_where_the_ranking_has_no_culprit() -> None:

@@ -32,6 +32,7 @@ from caliv_graph.physics import (
     ranked_with,
     raw_findings,
     warnings_of,
+    without_effects,
 )
 from caliv_graph.pipeline.mistakes import mistakes
 from caliv_graph.pipeline.preparation import Prepared, motions_of, prepare
@@ -175,6 +176,7 @@ def _calibrated(
         names = [recording.name for recording in recordings]
         clocks = clock_findings(names, solution.structure, calibration)
         findings = (*prepared.findings, *clocks)
+        doubts = without_effects(doubts, clocks, calibration)
         said, unread = prepared.mistakes, ""
         blamed = _blamed(calibration, concerned)
         if not said and prior is None and blamed is not None:

@@ -111,15 +111,19 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
             "With the sign of y changed",
             "Write the points with y to the left",
         )
+    what = "the poses are of a map with z down (north, east, down)"
     remedy = "Set data.pose_axes: ned"
-    if config.data.format == "caliv":
+    if config.data.pose_axes == "ned":
+        what = "the poses are of a map with z up, other than data.pose_axes: ned says"
+        remedy = "Set data.pose_axes: flu"
+    elif config.data.format == "caliv":
         remedy = (
             "Convert input/ego_poses.yaml to a vehicle with x forward, y left, z up, in a map "
             "with z up"
         )
     return (
-        "the poses are of a map with z down (north, east, down), or all clouds are left-handed (y "
-        "to the right): the vehicle turns right where they turn left",
+        f"{what}, or all clouds are left-handed (y to the right): the vehicle turns right where "
+        "they turn left",
         "With one of them mirrored",
         f"{remedy}; or, if the poses are right, write the points with y to the left",
     )

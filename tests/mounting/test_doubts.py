@@ -177,6 +177,12 @@ def test_left_handed_clouds_of_all_lidars_look_like_poses_of_north_east_down() -
     assert (doubt.kind, doubt.lidars) == ("mirrored", ("front", "rear"))
     assert "or all clouds are left-handed" in mistake_sentence(doubt, GUESSES)
     assert "write the points with y to the left" in mistake_sentence(doubt, GUESSES)
+    assert "Set data.pose_axes: ned" in mistake_sentence(doubt, GUESSES)
+    # Set already: then the poses were of a map with z up.
+    data = GUESSES.data.model_copy(update={"pose_axes": "ned"})
+    text = mistake_sentence(doubt, GUESSES.model_copy(update={"data": data}))
+    assert "a map with z up, other than data.pose_axes: ned says" in text
+    assert "Set data.pose_axes: flu" in text
 
 
 def test_a_mistake_of_the_config_is_said_once_of_several_drives() -> None:

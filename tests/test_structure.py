@@ -193,6 +193,11 @@ def test_where_none_is_found_a_warning_says_so(
         TargetError, match=r"no object stands still.*neither a target nor structure"
     ):
         run_on(drive)
+    # A mistake of the config that leaves nothing to see has its own remedy.
+    lidars = dict(drive.config.lidars)
+    lidars["front"] = lidars["front"].model_copy(update={"min_range": 30.0})
+    with pytest.raises(TargetError, match=r"of lidars 'front' 30 to 500 m is used \(min_range"):
+        run_on(drive.asked(lidars=lidars))
     for change in (
         {"structure": StructureConfig(use=False)},
         {"solve": SolveConfig(mode="staged")},

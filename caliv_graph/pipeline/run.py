@@ -49,7 +49,11 @@ from caliv_graph.structure.term import structure_terms
 from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS, too_many_outliers
 from caliv_graph.wording.contradictions import outliers_text
 from caliv_graph.wording.mounting import mistake_sentence
-from caliv_graph.wording.structure import nothing_sentence, wrong_target_sentence
+from caliv_graph.wording.structure import (
+    nothing_sentence,
+    ranges_sentence,
+    wrong_target_sentence,
+)
 
 
 def calibrate(
@@ -236,11 +240,25 @@ def structure_evidence(prepared: Prepared) -> StructureEvidence:
     return StructureEvidence(prepared.patches, structure_terms, slow_errors)
 
 
+NEAR_M, FAR_M = 5.0, 10.0
+"""A larger min_range, or a smaller max_range, takes away most of what LiDARs see, metres: of the
+ground, of a target that is passed at 5 m, of walls."""
+
+
 def without_anything(prepared: Prepared, error: TargetError) -> TargetError:
     """The error of drives of which structure tells nothing; with why there is no target."""
+    narrow = {
+        name: (lidar.min_range, lidar.max_range)
+        for name, lidar in prepared.config.lidars.items()
+        if lidar.min_range > NEAR_M or lidar.max_range < FAR_M
+    }
+    if narrow:
+        error = TargetError(error.what, ranges_sentence(narrow))
     if prepared.no_target is None:
-        return with_standing(error, prepared.trajectories) or error
-    return TargetError(nothing_sentence(str(prepared.no_target), error.what))
+        stood = None if narrow else with_standing(error, prepared.trajectories)
+        return stood or error
+    said = str(error) if narrow else error.what
+    return TargetError(nothing_sentence(str(prepared.no_target), said))
 
 
 def with_prior(

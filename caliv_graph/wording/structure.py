@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 
 def no_target_sentence(what: str) -> str:
@@ -21,6 +21,15 @@ def wrong_target_sentence(contradiction: str) -> str:
 def nothing_sentence(what: str, structure: str) -> str:
     """The error where neither target nor structure tells anything; why, of each."""
     return f"{what}. Structure does not replace it: {structure}"
+
+
+def ranges_sentence(ranges_m: Mapping[str, tuple[float, float]]) -> str:
+    """What to do about range limits (least, most) that leave LiDARs little of what they see."""
+    told = " and ".join(f"'{name}' {a:g} to {b:g} m" for name, (a, b) in ranges_m.items())
+    return (
+        f"Range limits drop most of what there is to see: of lidars {told} is used (min_range, "
+        "max_range). Widen them"
+    )
 
 
 def standing_sentence(moved_m: float, turned_deg: float, lasts_s: float) -> str:

@@ -585,6 +585,9 @@ def test_mistakes_of_guesses_are_looked_for_unless_the_motion_is_wrong(
     wrong = replace(sound, status="inconsistent", suspects=(suspect,))
     assert _blamed(wrong, concerned) == blamed
     assert _blamed(replace(wrong, status="ok"), concerned) is None
+    # Of swapped guesses that leave S2S open nothing is contradicted.
+    open_ = replace(sound, status="partial", unmet=("require s2s: x not determined",), suspects=())
+    assert _blamed(open_, ()) == ()
 
 
 @pytest.mark.skipif(not RELEASED.is_dir(), reason=f"the authors' drive is not at {RELEASED.name}")

@@ -221,9 +221,10 @@ def _blamed(calibration: Calibration, concerned: Sequence[str]) -> tuple[str, ..
 
     It is not where an input of the motion explains more. A drift is no such input: it takes up a
     part of whatever is wrong. `concerned` are LiDARs that contradictions of the solve are about.
+    From guesses far off, structure may tell too little to be contradicted, and less than required.
     """
     if calibration.status != "inconsistent":
-        return None
+        return () if calibration.unmet else None
     leading = {s.input for s in calibration.suspects[:1] if s.sigmas > CONTRADICTION_SIGMAS}
     if any(not key.endswith(".initial") and ".drift" not in key for key in leading):
         return None

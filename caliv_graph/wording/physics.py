@@ -493,6 +493,8 @@ def _height(misfit: Misfit, config: Config) -> tuple[str, tuple[float, ...], flo
         text += f"vehicle_height {value:.2f} +- {misfit.sigma:.2f} m {fits}"
         if misfit.dof == 1:
             text += f", or z of lidar '{next(iter(config.lidars))}' is wrong"
+        else:
+            text += f", or z of all guesses, {misfit.value:+.2f} m: both count from one frame"
     if _fit_inversely(misfit, config):
         text += (
             "; with the other sign z fits as well. Check that guesses say where a LiDAR is in the "

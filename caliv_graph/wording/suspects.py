@@ -186,7 +186,10 @@ _REMEDIES = {
         "Check the unit and the scale of the velocities in topics.twist, or set "
         "wheels.speed_scale_sigma"
     ),
-    "ground.vehicle_height": "Measure the height of the vehicle frame above the ground again",
+    "ground.vehicle_height": (
+        "Measure the height of the vehicle frame above the ground again, and check that z of the "
+        "guesses counts from that frame"
+    ),
     "poses.frame": "Check that topics.pose has the poses of the vehicle frame",
     "poses.drift": "The given poses drift by this range over the drive: use better ones",
     "gnss.drift": "The GNSS positions drift by this range over the drive: use better ones",

@@ -73,7 +73,8 @@ def test_what_is_nearly_a_contradiction_is_a_doubt(sigmas: float, said: bool) ->
     assert text == (
         "ground.vehicle_height may be wrong, by -0.20 m, so that it is 0.00 m (sigma 0.04 m): the "
         "data would rather have it so by 4.8 sigma, and 5 are a contradiction. Measure the height "
-        "of the vehicle frame above the ground again"
+        "of the vehicle frame above the ground again, and check that z of the guesses counts from "
+        "that frame"
         if said
         else ""
     )

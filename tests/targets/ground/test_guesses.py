@@ -52,6 +52,7 @@ def test_what_all_lidars_have_in_common_is_the_vehicle_height() -> None:
     assert (finding.input, finding.severity) == ("ground.vehicle_height", "contradiction")
     assert finding.value == pytest.approx((0.2,))
     assert "vehicle_height 0.20 +- 0.04 m would fit" in finding.sentence
+    assert "or z of all guesses, -0.30 m" in finding.sentence
 
 
 def test_what_one_lidar_has_alone_is_its_guess() -> None:

@@ -31,6 +31,11 @@ SHARPER = 1.6
 """Times as many points at one place from which a mistake is said. Measured on an arc and an S-curve
 past a chair and a few other objects: 2.3 to 15 for what was wrong, 1.3 at most for what was not."""
 
+LEAST_OF_PAIR, PAIR_SHARPER = 1.2, 2.0
+"""Of two LiDARs whose guesses are exchanged: the gain of each, and of both multiplied. What was not
+wrong has 1.3 each, 1.7 together, at most. Guesses with y to the right in a street, whose tilts are
+wrong as well, had 1.3 and 2.0; one of them alone seemed turned by 90 degrees, with 1.7."""
+
 ALIKE = 0.9
 """Explanations that sharpen the maps nearly as much: then the one whose guesses are nearer holds.
 On an arc a mounting may turn about the centre of the arc."""
@@ -204,6 +209,8 @@ def turned_over(T_vehicle_lidar: gtsam.Pose3, turn_deg: int) -> gtsam.Pose3:
 
 def _explains(gains: Array, kind: Kind) -> bool:
     """Whether the maps are so much sharper; of what concerns all, those of most."""
+    if kind == "exchanged":
+        return bool(gains.min() >= LEAST_OF_PAIR and gains.prod() >= PAIR_SHARPER)
     if kind in ("heading", "mirrored"):
         return bool(np.sort(gains)[(len(gains) - 1) // 2] >= SHARPER and gains.min() >= ALIKE)
     return bool(gains.min() >= SHARPER)

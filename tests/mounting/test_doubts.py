@@ -13,7 +13,7 @@ import pytest
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import Config
-from caliv_graph.mounting.doubts import Doubt, doubts
+from caliv_graph.mounting.doubts import Doubt, Kind, _explains, doubts
 from caliv_graph.mounting.place import place_lidars
 from caliv_graph.products import LidarScan, Trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
@@ -62,6 +62,22 @@ def test_topics_that_are_swapped() -> None:
     assert "the topics of lidars 'front' and 'rear' are swapped" in text
     assert "Exchange lidars.front.topic and lidars.rear.topic" in text
     assert "y of both guesses" not in text  # front and rear do not mirror each other
+
+
+@pytest.mark.parametrize(
+    ("gains", "kind", "explained"),
+    [
+        ((1.26, 2.03), "exchanged", True),  # a pair counts together
+        ((1.3, 1.3), "exchanged", False),
+        ((0.9, 4.0), "exchanged", False),  # only one of them is wrong
+        ((1.59,), "turned", False),
+        ((1.61,), "turned", True),
+    ],
+)
+def test_by_how_much_maps_must_be_sharper(
+    gains: tuple[float, ...], kind: Kind, explained: bool
+) -> None:
+    assert _explains(np.array(gains), kind) is explained
 
 
 def test_swapped_topics_of_a_symmetric_rig_may_be_guesses_with_y_to_the_right() -> None:

@@ -20,6 +20,10 @@ _ALIKE_S = 0.5
 _GAP_FACTOR = 1.75
 """An interval of more than so many usual ones is a gap: one lost message makes it two."""
 
+_PART_S, _PART_PERIODS = 3.0, 5.0
+"""Seconds, and usual intervals, that a topic may begin after or end before the others: recorders
+find topics one after the other, in a second or two."""
+
 TAI_UTC_S = 37.0
 """TAI minus UTC since 2017: the offset of a LiDAR on PTP from a computer on NTP."""
 
@@ -92,7 +96,11 @@ def read_clock(header_ns: IntArray, record_ns: IntArray) -> Clock:
 
 def clock_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
     """Warnings about the stamps of some topics of the bag `name`, one line each."""
-    return [*_offset_warnings(name, clocks), *_order_warnings(name, clocks)]
+    return [
+        *_offset_warnings(name, clocks),
+        *_order_warnings(name, clocks),
+        *_part_warnings(name, clocks),
+    ]
 
 
 def _offset_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
@@ -149,5 +157,32 @@ def _order_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
             lines.append(
                 f"{name}: {clock.duplicates} {of_all} have the stamp of another: the first "
                 "recorded is taken"
+            )
+    return lines
+
+
+def _part_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
+    """Topics that cover a part of the drive, by the time of their recording."""
+    spans = {}
+    for topic, clock in clocks.items():
+        if clock.messages:
+            ahead_ns = round(
+                (clock.offset_s[1] if clock.offset_s else 0.0) * NANOSECONDS_PER_SECOND
+            )
+            spans[topic] = clock.first_ns - ahead_ns, clock.last_ns - ahead_ns
+    if not spans:
+        return []
+    begin_ns, end_ns = min(a for a, _ in spans.values()), max(b for _, b in spans.values())
+    lines = []
+    for topic, (first_ns, last_ns) in spans.items():
+        usual_s = max(_PART_S, _PART_PERIODS * (clocks[topic].period_s or 0.0))
+        late_s = (first_ns - begin_ns) / NANOSECONDS_PER_SECOND
+        early_s = (end_ns - last_ns) / NANOSECONDS_PER_SECOND
+        parts = [f"begins {late_s:.1f} s after the first"] if late_s > usual_s else []
+        parts += [f"ends {early_s:.1f} s before the last"] if early_s > usual_s else []
+        if parts:
+            lines.append(
+                f"{name}: {topic} {' and '.join(parts)} of the topics: the rest of the drive is "
+                "calibrated without it, or not at all"
             )
     return lines

@@ -80,3 +80,19 @@ def test_few_messages() -> None:
     assert (none.messages, none.rate_hz, none.offset_s) == (0, None, None)
     assert read_clock(TENTHS[:1], TENTHS[:1]).rate_hz is None
     assert read_clock(TENTHS[[0, 0]], TENTHS[:2]).duplicates == 1
+
+
+def test_a_topic_that_stops_halfway_is_named() -> None:
+    times = 1_700_000_000_000_000_000 + np.arange(300) * 100_000_000  # 30 s
+    whole, half = read_clock(times, times), read_clock(times[:180], times[:180])
+    (line,) = clock_warnings("bag", {"/imu": whole, "/gnss": half})
+    assert line.startswith("bag: /gnss ends 12.0 s before the last of the topics")
+    late = read_clock(times[50:], times[50:])
+    (line,) = clock_warnings("bag", {"/imu": whole, "/gnss": late})
+    assert line.startswith("bag: /gnss begins 5.0 s after the first")
+    # Of another epoch: what counts is when it was recorded.
+    boot = read_clock(times - 1_699_999_000_000_000_000, times)
+    assert not any("ends" in line for line in clock_warnings("bag", {"/imu": whole, "/l": boot}))
+    # One message in 10 s ends when it does.
+    rare = read_clock(times[::100], times[::100])
+    assert clock_warnings("bag", {"/imu": whole, "/pose": rare}) == []

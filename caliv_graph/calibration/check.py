@@ -122,7 +122,10 @@ def check(
     # Of guesses that are off together none is more likely wrong than the others.
     of_all = any(isinstance(each, GuessesTogether) for each in found)
     one = leads and not (of_all and suspects[0].input.endswith(".initial"))
-    sentences = [ranking_sentence(suspects)] if one else []
+    of_wheels = any(
+        isinstance(t, SmoothedTrajectory) and t.data.wheels is not None for t in trajectories
+    )
+    sentences = [ranking_sentence(suspects, of_wheels)] if one else []
     sentences += [contradiction_sentence(each, leads) for each in found]
     if sentences:
         calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))

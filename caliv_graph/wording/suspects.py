@@ -21,8 +21,11 @@ LEAST_NEXT = 3.0
 """Sigmas that a suspect must still explain, once the first is freed, to be named after it."""
 
 
-def ranking_sentence(suspects: Sequence[Suspect]) -> str:
-    """The first suspect, what it explains and what to do; then those that explain more."""
+def ranking_sentence(suspects: Sequence[Suspect], of_wheels: bool = False) -> str:
+    """The first suspect, what it explains and what to do; then those that explain more.
+
+    `of_wheels`: there was no IMU. Then an axle that is elsewhere looks like an antenna that is.
+    """
     first, *rest = suspects
     following = sorted(
         (s for s in rest if s.sigmas_left > LEAST_NEXT), key=lambda s: -s.sigmas_left
@@ -32,6 +35,15 @@ def ranking_sentence(suspects: Sequence[Suspect]) -> str:
     return (
         f"most likely: {first.input}, {_by(first)}; it explains {100.0 * first.explains:.0f} "
         f"percent of the contradiction ({first.sigmas:.0f} sigma){then}. {remedy(first)}"
+        f"{_or_axle(first) if of_wheels and first.input == 'gnss.lever_arm' else ''}"
+    )
+
+
+def _or_axle(arm: Suspect) -> str:
+    other = vector([0.0 - value for value in arm.change], arm.units, arm.determined, "-")
+    return (
+        f". Or the axle that does not steer is elsewhere: wheels.T_vehicle_wheels.xyz by {other}, "
+        "if guesses of LiDARs are contradicted as well"
     )
 
 

@@ -100,3 +100,22 @@ def test_every_suspect_has_a_remedy(name: str, said: str) -> None:
     assert said in text
     # A moved mount is named for a mount only.
     assert ("moved" in text) == (".mount." in name)
+
+
+def test_without_an_imu_an_axle_that_is_elsewhere_looks_like_the_antenna() -> None:
+    told = (True, True, False)
+    arm = Suspect(
+        "gnss.lever_arm",
+        (2.1, 0.1, 1.6),
+        (0.04, 0.01, 1.0),
+        (1.3, 0.0, 0.0),
+        ("m",) * 3,
+        0.5,
+        14.0,
+        14.0,
+        told,
+    )
+    assert "wheels" not in ranking_sentence([arm])
+    text = ranking_sentence([arm], of_wheels=True)
+    assert "Or the axle that does not steer is elsewhere: wheels.T_vehicle_wheels.xyz" in text
+    assert "by (-1.30, " in text

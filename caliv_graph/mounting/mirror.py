@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import gtsam
 import numpy as np
 
 from caliv_graph.geometry.se3 import vehicle_axes_difference
-from caliv_graph.products import Array
 
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 
 _AXES = [2, 3, 4, 5]
 """Yaw, x, y and z. Roll and pitch are small, and users write them with either sign."""
 
-_SIGMAS = 3.0
-"""Of the difference of two guesses, up to which one is the mirror image of the other."""
+_ALIKE = np.array([math.radians(15.0), 0.3, 0.3, 0.3])
+"""Difference of yaw (rad), x, y and z (m) up to which two sides of a vehicle are alike: guesses
+are 3 degrees and 0.1 m off, and mounts of a symmetric rig differ by a few degrees more."""
 
 
 def mirrored(T_vehicle_lidar: gtsam.Pose3) -> gtsam.Pose3:
@@ -23,15 +25,11 @@ def mirrored(T_vehicle_lidar: gtsam.Pose3) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3(R), _MIRROR @ T_vehicle_lidar.translation())
 
 
-def are_mirror_images(
-    guesses: tuple[gtsam.Pose3, gtsam.Pose3], sigmas: tuple[Array, Array]
-) -> bool:
-    """Whether two LiDARs stand on either side of a vehicle, as alike as their guesses are known.
+def are_mirror_images(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
+    """Whether two LiDARs stand on either side of a vehicle, by their guesses.
 
-    `sigmas` (6,) are of the guesses, vehicle axes, rad and m. One LiDAR in the middle is no pair.
+    Two that are one behind the other in the middle are no such pair.
     """
-    one, other = guesses
     off = np.abs(vehicle_axes_difference(mirrored(one), other))[_AXES]
-    limits = _SIGMAS * np.hypot(*sigmas)[_AXES]
     apart = np.abs(vehicle_axes_difference(one, other))[_AXES]
-    return bool((off < limits).all() and (apart > limits).any())
+    return bool((off < _ALIKE).all() and (apart > _ALIKE).any())

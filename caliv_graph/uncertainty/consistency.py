@@ -392,9 +392,7 @@ def against_guesses(
                 speed_m_s=speed_m_s,
                 frame=_already_in(name, lidars),
                 mirrored=other is not None
-                and are_mirror_images(
-                    (guess.T_vehicle_lidar, other.T_vehicle_lidar), (guess.sigmas, other.sigmas)
-                ),
+                and are_mirror_images(guess.T_vehicle_lidar, other.T_vehicle_lidar),
             )
 
 

@@ -85,7 +85,7 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
         a, b = found.lidars
         what = f"the topics of lidars {names[0]} and {names[1]} are swapped"
         remedy = f"Exchange lidars.{a}.topic and lidars.{b}.topic"
-        if _mirror_each_other(a, b, config):
+        if are_mirror_images(config.lidars[a].guess(), config.lidars[b].guess()):
             what += ", or y of both guesses counts to the right, for they mirror each other"
             remedy += f"; or, with y to the right in the guesses, {WITH_Y_LEFT}"
         return what, "With the initial guess of the other one", remedy
@@ -99,7 +99,7 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
             f"Set lidars.{name}.initial.rpy_deg to about [{roll:.1f}, {pitch:.1f}, {right:.1f}]",
         )
     if found.kind == "framed":
-        frame = f"that of lidar '{found.frame}'" if found.frame else "the vehicle frame"
+        frame = f"the frame of lidar '{found.frame}'" if found.frame else "the vehicle frame"
         return (
             f"the clouds of lidar {names[0]} are in {frame} already, moved there by a driver or a "
             "node",
@@ -135,12 +135,6 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
         "With one of them mirrored",
         f"{remedy}; or, if the poses are right, write the points with y to the left",
     )
-
-
-def _mirror_each_other(a: str, b: str, config: Config) -> bool:
-    one, other = config.lidars[a], config.lidars[b]
-    guesses, sigmas = (one.guess(), other.guess()), (one.sigma.sigmas(), other.sigma.sigmas())
-    return are_mirror_images(guesses, sigmas)
 
 
 def _turn(found: Doubt) -> str:

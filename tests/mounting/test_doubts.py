@@ -84,7 +84,7 @@ def test_swapped_topics_of_a_symmetric_rig_may_be_guesses_with_y_to_the_right() 
     """Of a vehicle with x forward, y right, z down: y, pitch and yaw have the other sign."""
     guesses = {
         name: gtsam.Pose3(
-            gtsam.Rot3.RzRyRx(0.0, -0.17, math.radians(side * 40.0)),
+            gtsam.Rot3.RzRyRx(0.0, -0.17, math.radians(side * 40.0 + 5.0)),
             np.array([1.2, side * 0.6, 1.8]),
         )
         for name, side in (("left", -1.0), ("right", 1.0))
@@ -144,7 +144,7 @@ def test_clouds_that_are_in_another_frame_already(frame: str, T: gtsam.Pose3) ->
     (doubt,) = doubts([drive], [DRIVE.way], GUESSES, SilentProgress())
     assert (doubt.kind, doubt.lidars, doubt.frame) == ("framed", ("rear",), frame)
     text = mistake_sentence(doubt, GUESSES)
-    named = "that of lidar 'front'" if frame else "the vehicle frame"
+    named = "the frame of lidar 'front'" if frame else "the vehicle frame"
     assert f"the clouds of lidar 'rear' are in {named} already" in text
 
 

@@ -25,6 +25,7 @@ from caliv_graph.errors import TargetError
 from caliv_graph.fusion.compare import compare
 from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.se3 import vehicle_axes_difference
+from caliv_graph.mounting.doubts import Doubt
 from caliv_graph.pipeline import calibrate, look, with_prior
 from caliv_graph.products import Calibration, MotionData, Recording
 from caliv_graph.readers.forwarding import ForwardingRecording
@@ -282,3 +283,13 @@ def test_other_commands_do_without_a_target(walls: Structure) -> None:
     halves = split_halves(drive.recording, drive.config, NO_PROGRESS, 1e-3)
     assert halves.comparison is None
     assert "target" in halves.reason
+
+
+def test_where_structure_tells_nothing_a_mistake_of_the_guesses_is_the_cause(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = Doubt(0, "drive", "left_handed", ("front",), 0, {"front": (1.1, 4.0)}, given=False)
+    monkeypatch.setattr("caliv_graph.pipeline.run.mistakes", lambda *_, **__: (found,))
+    monkeypatch.setattr("caliv_graph.pipeline.run.structure_terms", lambda *_: ())
+    with pytest.raises(TargetError, match=r"neither a target nor structure.*left-handed"):
+        run_on(arc().asked(target=False))

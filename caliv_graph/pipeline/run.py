@@ -158,6 +158,9 @@ def _calibrated(
             structure_evidence(prepared),
         )
     except TargetError as error:
+        causes = _causes(recordings, prepared, motions, guessed, progress)
+        if causes:
+            raise TargetError(error.what, causes) from error
         raise without_anything(prepared, error) from error
     with progress.stage("checking the result", None):
         calibration = assemble(
@@ -214,6 +217,27 @@ def _calibrated(
     calibration = replace(calibration, warnings=tuple(dict.fromkeys(warnings)))
     run = CalibrationRun(calibration, solution, prepared.observations, record)
     return run, bool(said)
+
+
+def _causes(
+    recordings: Sequence[Recording],
+    prepared: Prepared,
+    motions: dict[int, MotionData],
+    config: Config,
+    progress: Progress,
+) -> str:
+    """Mistakes that explain why structure tells nothing, if they were not looked for; or nothing.
+
+    What is left-handed all about, or far from where the guess has it, stands still nowhere.
+    """
+    if prepared.mistakes:
+        return ""
+    raw = raw_findings(motions, config)
+    try:
+        found = mistakes(recordings, prepared.trajectories, motions, config, progress, raw)
+    except CalivError:
+        return ""
+    return " ".join(mistake_sentence(doubt, config) for doubt in found)
 
 
 def _blamed(calibration: Calibration, concerned: Sequence[str]) -> tuple[str, ...] | None:

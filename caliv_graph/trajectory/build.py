@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Set
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -260,14 +261,24 @@ def _add_gauge_prior(graph: TrajectoryGraph, data: SmootherInput, states: States
 
 def to_values(states: States, data: SmootherInput) -> gtsam.Values:
     """An estimate as GTSAM's values."""
-    out = gtsam.Values()
+    biases = gtsam.VectorValues()
+    for i, bias in enumerate(np.hstack([states.force_bias, states.gyro_bias])):
+        biases.insert(key_bias(i), bias)
+    out = _no_biases(len(states.p_map_imu)).retract(biases)
     for i in range(len(states.p_map_imu)):
         out.insert(key_imu(i), gtsam.Pose3(gtsam.Rot3(states.R_map_imu[i]), states.p_map_imu[i]))
         out.insert(key_velocity(i), states.velocity_map[i])
-        bias = gtsam.imuBias.ConstantBias(states.force_bias[i], states.gyro_bias[i])
-        out.insert(key_bias(i), bias)
     if data.yaw_bias:
         out.insert(key_yaw_bias(), np.array([states.yaw_bias_rad]))
+    return out
+
+
+@lru_cache(maxsize=8)
+def _no_biases(n: int) -> gtsam.Values:
+    """Biases of n nodes, all zero. To insert one takes as long as all else of a node together."""
+    out = gtsam.Values()
+    for i in range(n):
+        out.insert(key_bias(i), gtsam.imuBias.ConstantBias())
     return out
 
 

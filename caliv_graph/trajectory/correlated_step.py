@@ -16,7 +16,7 @@ from caliv_graph.conventions import key_yaw_bias
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate, build_graph, from_values
 from caliv_graph.trajectory.chain import POSE, STATE, Chain, beside
-from caliv_graph.trajectory.chain_solution import solved
+from caliv_graph.trajectory.chain_solution import ChainSolution, solved
 from caliv_graph.trajectory.columns import parameter_columns
 from caliv_graph.trajectory.correlated import AXES, CorrelatedError, add_prior, linearised_in_parts
 from caliv_graph.trajectory.solve import step_of, without_right_side
@@ -62,15 +62,8 @@ def step_with_errors(
     data, estimate, n = settled.data, settled.estimate, len(nodes)
     none = np.zeros((n, AXES * len(errors)))
     start = chain_with_errors(settled, linear, nodes, errors, none)
-    chain, gradient = without_right_side(start)
     first = 1 if data.yaw_bias else 0
-    if settled.parameters:
-        at = np.arange(first, len(chain.corner))
-        weight = np.concatenate([np.asarray(p.sigmas) for p in settled.parameters]) ** -2
-        chain.corner[at, at] += weight
-        offset = np.concatenate([np.asarray(p.offset) for p in settled.parameters])
-        gradient[len(gradient) - len(at) :] += weight * offset
-    found = solved(chain, gradient)
+    found = _solved_with_priors(settled, start)
     width = STATE + AXES * len(errors)
     by_node, common = found.step[: n * width].reshape(n, width), found.step[n * width :]
     parameters = settled.parameters
@@ -98,6 +91,32 @@ def step_with_errors(
         cov=_of_vehicle(after, found.cov[:, :POSE, :POSE], found.cov_border[:, :POSE, first:]),
         chain=chain_with_errors(after, linear, nodes, errors, estimated),
     )
+
+
+def covariances_with_parameters(settled: Settled, chain: Chain) -> Array:
+    """(n, 6, 6) covariances of the vehicle's poses, without correlated errors.
+
+    `chain` is that of the settled graph and its columns (`solve.chain_of`).
+
+    Raises:
+        TrajectoryError: the graph is singular.
+    """
+    first = 1 if settled.data.yaw_bias else 0
+    found = _solved_with_priors(settled, chain)
+    return _of_vehicle(settled, found.cov[:, :POSE, :POSE], found.cov_border[:, :POSE, first:])
+
+
+def _solved_with_priors(settled: Settled, start: Chain) -> ChainSolution:
+    """The solution of a chain with a right-hand side, the priors of the parameters included."""
+    chain, gradient = without_right_side(start)
+    if settled.parameters:
+        first = 1 if settled.data.yaw_bias else 0
+        at = np.arange(first, len(chain.corner))
+        weight = np.concatenate([np.asarray(p.sigmas) for p in settled.parameters]) ** -2
+        chain.corner[at, at] += weight
+        offset = np.concatenate([np.asarray(p.offset) for p in settled.parameters])
+        gradient[len(gradient) - len(at) :] += weight * offset
+    return solved(chain, gradient)
 
 
 def _of_vehicle(settled: Settled, cov_imu: Array, cross: Array) -> Array:

@@ -40,6 +40,10 @@ BRIDGE_FORCE_M_S2 = 1.5
 BRIDGE_STEP_NS = 20_000_000
 """Integration step in a gap: 50 Hz, the slowest rate of a usual IMU."""
 
+KEPT_QUESTIONS, KEPT_INSTANTS = 8, 3000
+"""Of `DeadReckoning`: how many questions it keeps the answers of, of how many instants each at
+most. They are 3 MB; longer drives have other costs."""
+
 INTEGRATION_DENSITY_M = 1e-5
 """m/sqrt(s), noise of the position alone: 3 micrometres over 0.1 s. Without it GTSAM's covariance
 of one step is singular."""
@@ -254,7 +258,23 @@ class DeadReckoning:
         np.cumsum(v[:-1] * dt[:, None] + np.einsum("nij,nj->ni", R[:-1], dp), axis=0, out=p[1:])
         return R, v, p
 
+    @cached_property
+    def _known(self) -> dict[bytes, tuple[Array, Array, Array]]:
+        """What `_at` was asked for last: parameters of the input move readings, not instants."""
+        return {}
+
     def _at(self, stamps_ns: IntArray) -> tuple[Array, Array, Array]:
+        if len(stamps_ns) > KEPT_INSTANTS:
+            return self._worked_out(stamps_ns)
+        asked = np.asarray(stamps_ns, np.int64).tobytes()
+        found = self._known.get(asked)
+        if found is None:
+            while len(self._known) >= KEPT_QUESTIONS:
+                self._known.pop(next(iter(self._known)))
+            found = self._known[asked] = self._worked_out(stamps_ns)
+        return found
+
+    def _worked_out(self, stamps_ns: IntArray) -> tuple[Array, Array, Array]:
         R, v, p = self._cumulative
         k = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, "right") - 1, 0, len(R) - 2)
         # Beyond the ends the line through the first or last two readings is extended.

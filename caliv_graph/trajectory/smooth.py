@@ -17,7 +17,11 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray, MotionData, Trajectory
 from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
-from caliv_graph.trajectory.correlated_step import WithErrors, step_with_errors
+from caliv_graph.trajectory.correlated_step import (
+    WithErrors,
+    covariances_with_parameters,
+    step_with_errors,
+)
 from caliv_graph.trajectory.initial import first_states
 from caliv_graph.trajectory.initial_wheels import first_wheel_states
 from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources, scaled
@@ -41,7 +45,6 @@ from caliv_graph.trajectory.uncertain import (
     are_wide,
     settle,
     uncertain_parameters,
-    vehicle_covariances,
     with_late_clock,
 )
 from caliv_graph.trajectory.variances import estimated_scales
@@ -170,12 +173,12 @@ def _last_step(
     if errors:
         return step_with_errors(settled, linear, nodes, dropped, errors)
     data = settled.data
+    chain = chain_of(linear, len(nodes), data.yaw_bias, settled.columns)
     if settled.parameters:
-        cov = vehicle_covariances(settled, cov_imu)
+        cov = covariances_with_parameters(settled, chain)
     else:
         Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
         cov = Ad @ cov_imu @ Ad.T
-    chain = chain_of(linear, len(nodes), data.yaw_bias, settled.columns)
     return WithErrors(settled, np.zeros((len(nodes), 0)), cov, chain)
 
 

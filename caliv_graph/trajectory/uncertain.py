@@ -13,7 +13,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from caliv_graph.conventions import key_imu, key_parameters
+from caliv_graph.conventions import key_parameters
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate, from_values
@@ -335,28 +335,3 @@ def _eliminated(
         return graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
     except RuntimeError:  # GTSAM's report of a singular system
         raise TrajectoryError(UNDETERMINED) from None
-
-
-def vehicle_covariances(settled: Settled, cov_imu: Array) -> Array:
-    """(n, 6, 6) covariances of the vehicle's poses, the parameters' included.
-
-    `cov_imu` (n, 6, 6) is that of the IMU's poses where the parameters are known.
-    """
-    data, n = settled.data, len(cov_imu)
-    sigmas = np.concatenate([np.asarray(p.sigmas) for p in settled.parameters])
-    estimate = settled.estimate
-    assert settled.columns is not None
-    linear = _with_variable(estimate.graph.factors.linearize(estimate.values), settled.columns)
-    # The states follow a parameter linearly, whatever moves it: here another mean of its prior.
-    moves, states = [], []
-    for mean in np.vstack([np.zeros(len(sigmas)), np.diag(sigmas)]):
-        solution = _eliminated(linear, n, data.yaw_bias, mean, 1e-3 * sigmas).optimize()
-        moves.append(solution.at(key_parameters()))
-        states.append([solution.at(key_imu(i)) for i in range(n)])
-    moved, poses = np.array(moves[1:]) - moves[0], np.array(states[1:]) - np.array(states[0])
-    by_parameter = np.einsum("kl,lni->nik", np.linalg.inv(moved), poses)
-    # X = I T_vehicle_imu^-1: the vehicle also moves where the parameter is that transform.
-    by_parameter -= np.hstack([p.parameter.imu_moves(data) for p in settled.parameters])
-    total = cov_imu + by_parameter @ settled.cov @ np.swapaxes(by_parameter, 1, 2)
-    Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
-    return np.asarray(Ad @ total @ Ad.T)

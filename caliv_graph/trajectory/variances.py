@@ -300,21 +300,31 @@ def contradicted(likelihood: NoiseLikelihood) -> dict[str, float]:
     scales, best = fit(likelihood, names)
     away = {name for name, s in scales.items() if max(s, 1.0 / s) > LARGEST_RIGHT}
     enough = best + EVIDENCE
-    kept = {name for name in away if fit(likelihood, names - {name}, enough)[1] - best > EVIDENCE}
+    # Each begins where the fit of all has ended: mostly it is below `enough` there already.
+    kept = {
+        name
+        for name in away
+        if fit(likelihood, names - {name}, enough, scales)[1] - best > EVIDENCE
+    }
     if kept == names:
         return scales
-    return fit(likelihood, kept)[0] if kept else {}
+    return fit(likelihood, kept, start=scales)[0] if kept else {}
 
 
 def fit(
-    likelihood: NoiseLikelihood, free: Set[str], enough: float = -math.inf
+    likelihood: NoiseLikelihood,
+    free: Set[str],
+    enough: float = -math.inf,
+    start: Mapping[str, float] | None = None,
 ) -> tuple[dict[str, float], float]:
     """Scales of the `free` noise levels at the maximum of likelihood times prior.
 
     The others are 1. Returns them, and -2 log of likelihood times prior. The fit ends early where
-    this falls below `enough`: every step descends, so that it would end below as well.
+    this falls below `enough`: every step descends, so that it would end below as well. It begins at
+    the scales `start`; None: at the stated noise.
     """
     at = [i for i, name in enumerate(likelihood.names) if name in free]
+    names = [likelihood.names[i] for i in at]
     logarithms = np.zeros(len(likelihood.names))
     begin = likelihood.as_stated[0]
 
@@ -337,6 +347,9 @@ def fit(
         return {}, begin
     if begin <= enough:
         return dict.fromkeys(free, 1.0), begin
+    first = np.log([1.0 if start is None else start[name] for name in names])
+    if start is not None and (value := cost(first)[0] + begin) <= enough:
+        return {name: start[name] for name in names}, value
 
     def check(intermediate_result: OptimizeResult) -> None:
         if intermediate_result.fun + begin <= enough:
@@ -344,7 +357,7 @@ def fit(
 
     found = minimize(
         cost,
-        np.zeros(len(at)),
+        first,
         jac=True,
         method="L-BFGS-B",
         bounds=[tuple(np.log(SCALE_BOUNDS))] * len(at),
@@ -352,5 +365,4 @@ def fit(
         options={"ftol": 1e-9, "gtol": 0.5, "maxiter": 30},
     )
     scales = np.exp(np.asarray(found.x)).tolist()
-    names = [likelihood.names[i] for i in at]
     return dict(zip(names, scales, strict=True)), float(found.fun) + begin

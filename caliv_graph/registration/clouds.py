@@ -88,15 +88,21 @@ class CloudStack:
     whole: tuple[Array, ...]
     sigma_range_m: float
 
+    def points_of(self, which: IntArray) -> IntArray:
+        """Indices of the points of these clouds, one cloud after the other."""
+        sizes = self.sizes[which]
+        before = np.cumsum(sizes) - sizes
+        return np.asarray(
+            np.arange(int(sizes.sum())) + np.repeat(self.starts[which] - before, sizes)
+        )
+
     def only(self, which: IntArray) -> CloudStack:
         """The clouds at these indices; one that is named twice is there twice."""
-        sizes = self.sizes[which]
-        starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
-        kept = np.arange(int(sizes.sum())) + np.repeat(self.starts[which] - starts, sizes)
+        sizes, kept = self.sizes[which], self.points_of(which)
         return CloudStack(
             points=self.points[kept],
             cloud=np.repeat(np.arange(len(which)), sizes),
-            starts=starts,
+            starts=np.cumsum(sizes) - sizes,
             lidar=self.lidar[which],
             beams=self.beams[kept],
             normals=self.normals[kept],

@@ -115,6 +115,7 @@ def expect(
     cloud_weights: Array,
     held_along: float = 0.0,
     by_beams: bool = False,
+    near: IntArray | None = None,
 ) -> Responsibilities:
     """E-step: which surfel each beam returned from, and the weights of the points' heights.
 
@@ -129,8 +130,10 @@ def expect(
         held_along: weight of what holds points along the surface, per square metre; 0: nothing.
         by_beams: poses and surfels are right to some millimetres, so that the beam tells which
             surfel it met. Until then the normals of the points do.
+        near: (N, k) the surfels of each point that are looked at, by an earlier E-step
+            (`Responsibilities.component`); None: searched for.
     """
-    step = _EStep(stack, mixture, noise, outlier_density, cloud_weights, held_along, by_beams)
+    step = _EStep(stack, mixture, noise, outlier_density, cloud_weights, held_along, by_beams, near)
     points = stack.moved(R, t)
     normals, beams = stack.rotated(R, stack.normals), stack.rotated(R, stack.beams)
     pieces = parts(len(points), len(points) // PART_POINTS + 1)
@@ -185,6 +188,7 @@ class _EStep:
     cloud_weights: Array
     held_along: float
     by_beams: bool
+    near: IntArray | None = None
 
     @cached_property
     def _surfels(self) -> Surfels:
@@ -203,6 +207,7 @@ class _EStep:
             self.stack.flatness[part],
             reach_m,
             cloud if self.by_beams else None,
+            None if self.near is None else self.near[part],
         )
         cosine = np.maximum(met.facing, STEEP)
         variance = noise.variance(cosine, lidar)

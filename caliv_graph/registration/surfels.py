@@ -174,13 +174,16 @@ class Surfels:
         flatness: Array,
         reach_m: float,
         cloud: IntArray | None = None,
+        near: IntArray | None = None,
     ) -> Met:
         """What the beams of points meet; all (n, 3), flatness (n,), target frame.
 
         With their clouds (n,), ascending, beams alone tell which surfels, and not the normals of
-        the points.
+        the points. `near` (n, k) are those to look at, by an earlier search; None: searched for.
         """
-        if cloud is None:
+        if near is not None:
+            pass
+        elif cloud is None:
             near = self.nearest(points, normals)
         else:
             near = self.nearest_to_beams(points, beams, cloud)

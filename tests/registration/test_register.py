@@ -15,21 +15,23 @@ from threadpoolctl import threadpool_limits
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import unstack
-from caliv_graph.products import Array, Mixture, Registration, Side
+from caliv_graph.products import Array, IntArray, Mixture, Registration, Side
 from caliv_graph.registration.centring import centre_clouds, depth_of
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import LEAST_EXTENT_M, expect, maximise_shape, seed_mixture
-from caliv_graph.registration.moments import cell_moments
+from caliv_graph.registration.moments import Responsibilities, cell_moments
 from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
 from caliv_graph.registration.register import (
     MAX_STEP,
+    NEIGHBOURS_HELD,
     JointRegistration,
     annealing_steps,
     free_step,
     left_step,
     register_jointly,
 )
+from caliv_graph.registration.surfels import Surfels
 from tests.registration.scenes import (
     Scene,
     chair_scene,
@@ -538,6 +540,44 @@ def test_the_noise_of_the_heights_is_estimated_at_the_end_of_annealing() -> None
         state.expect(R, t)
         state.maximise(R, t)
     assert math.sqrt(state.noise.range_m2[0]) == pytest.approx(SIGMA_M, rel=0.25)
+
+
+def test_surfels_near_the_beams_are_searched_for_at_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = JointRegistration(observe(clouds_of(chair())), config_of(lidar_range_m=0.005))
+    R, t = matrices(chair().T_target_lidar)
+    state.by_beams, state.held_along = True, 0.0
+    state.seed(R, t, 0.02)
+    while not state.finest:
+        state.expect(R, t)
+        state.maximise(R, t)
+    begun, searched = list[int](), set[int]()
+    search = Surfels.nearest_to_beams
+
+    def watched(surfels: Surfels, points: Array, beams: Array, cloud: IntArray) -> IntArray:
+        searched.add(begun[-1])
+        return search(surfels, points, beams, cloud)
+
+    monkeypatch.setattr(Surfels, "nearest_to_beams", watched)
+    for number in range(2 * (NEIGHBOURS_HELD + 1)):
+        begun.append(number)
+        who = state.responsibilities(R, t)
+        state.quadratic(R, t, who)
+        state.maximise(R, t)
+    # The last E-step that annealing took was by beams, too.
+    assert searched == {NEIGHBOURS_HELD, 2 * NEIGHBOURS_HELD + 1}
+
+    def looking_at(near: IntArray | None) -> Responsibilities:
+        weights = np.ones(state.clouds.count)
+        noise, shape = state.noise, state.mixture
+        return expect(state.clouds, R, t, shape, noise, 0.07, weights, by_beams=True, near=near)
+
+    held, anew = looking_at(who.component), looking_at(None)
+    assert np.abs(held.slides_m - anew.slides_m).mean() < 1e-5
+    assert held.inlier_ratio == pytest.approx(anew.inlier_ratio, abs=1e-3)
+    # Some of the clouds, in another order, look at what was found for theirs.
+    which = np.array([3, 1])
+    alone = state.only(which).responsibilities(R[which], t[which])
+    assert (alone.component == who.component[state.clouds.points_of(which)]).all()
 
 
 # ------------------------------------------------------------------ errors and weights

@@ -10,14 +10,18 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.conventions import key_imu, key_parameters
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, MotionData
+from caliv_graph.trajectory.columns import columns_of
 from caliv_graph.trajectory.inputs import check_input
 from caliv_graph.trajectory.mounting import COURSE_SIGMA_RAD, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.smooth import _solved_roughly, smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.solve import covariances_of
+from caliv_graph.trajectory.uncertain import _eliminated, _with_variable
 from tests.trajectory.motions import (
     Course,
     Sensors,
@@ -42,6 +46,31 @@ def marginals(smoothed: SmoothedTrajectory) -> Array:
     at = np.arange(12, len(information))
     information[at, at] += np.concatenate([np.asarray(p.sigmas) for p in smoothed.parameters]) ** -2
     return np.asarray(np.linalg.inv(information)[12:, 12:])
+
+
+def by_gtsam(smoothed: SmoothedTrajectory) -> Array:
+    """(n, 6, 6) covariances of the vehicle's poses at the nodes, by the Bayes tree.
+
+    The states follow a parameter linearly, whatever moves it: here another mean of its prior.
+    """
+    data, n = smoothed.data, len(smoothed.nodes_ns)
+    parameters = [p.parameter for p in smoothed.parameters]
+    sigmas = np.concatenate([np.asarray(p.sigmas) for p in smoothed.parameters])
+    estimate = smoothed.estimate()
+    linear = estimate.graph.factors.linearize(estimate.values)
+    cov_imu, _ = covariances_of(linear, data, estimate.states)
+    graph = _with_variable(linear, columns_of(smoothed, estimate, parameters))
+    moves, states = [], []
+    for mean in np.vstack([np.zeros(len(sigmas)), np.diag(sigmas)]):
+        solution = _eliminated(graph, n, data.yaw_bias, mean, 1e-3 * sigmas).optimize()
+        moves.append(solution.at(key_parameters()))
+        states.append([solution.at(key_imu(i)) for i in range(n)])
+    moved, poses = np.array(moves[1:]) - moves[0], np.array(states[1:]) - np.array(states[0])
+    by_parameter = np.einsum("kl,lni->nik", np.linalg.inv(moved), poses)
+    by_parameter -= np.hstack([p.imu_moves(data) for p in parameters])
+    total = cov_imu + by_parameter @ smoothed.parameter_cov @ np.swapaxes(by_parameter, 1, 2)
+    Ad = np.asarray(data.T_vehicle_imu.AdjointMap())
+    return np.asarray(Ad @ total @ Ad.T)
 
 
 def nees(motion: MotionData, smoothed: SmoothedTrajectory) -> float:
@@ -87,10 +116,12 @@ def test_what_was_measured_roughly_is_in_the_covariance_of_every_pose() -> None:
     # 10 mm of the lever arm less what the drive tells of it; 0.1 degrees of pitch and yaw.
     assert (sigma[:, 3:] > least[:, 3:] + 0.003).all()
     assert (sigma[:, :3] > 1e-3).all()
-    # Two ways to the same marginals: GTSAM's Bayes tree, and the chain.
+    # Three ways to the same marginals: two of the chain, and GTSAM's Bayes tree.
     cov = np.linalg.inv(rough.joint_information(WANTED)[0])
     blocks = [cov[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(WANTED))]
     np.testing.assert_allclose(rough.trajectory.cov, blocks, rtol=1e-5, atol=1e-12)
+    at = np.searchsorted(rough.nodes_ns, WANTED)
+    np.testing.assert_allclose(rough.trajectory.cov, by_gtsam(rough)[at], rtol=1e-4, atol=1e-11)
     assert nees(motion, rough) < 12.0
 
 

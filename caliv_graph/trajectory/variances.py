@@ -84,6 +84,10 @@ EVIDENCE = 9.0
 """Increase of -2 log L, by holding a scale at 1, from which the stated sigma counts as wrong: 3
 sigma. Beside a slow error of the fixes, the noise of an accelerometer is hardly known."""
 
+FIT_TOLERANCE = 0.05
+"""Derivative of -2 log L by a scale's logarithm, in units of how well that is told, at which a fit
+ends: a twentieth of its standard deviation."""
+
 UNKNOWN_SIGMA = 3.0
 """Prior of a lever arm (m) and of the IMU's rotation (rad) that are free: larger than any error."""
 
@@ -231,12 +235,19 @@ class NoiseLikelihood:
 
     def at(self, scales: Array) -> tuple[float, Array]:
         """-2 log L at scales (m,) of `names`, and its derivatives by their logarithms."""
-        weights = scales**-2.0
-        total = _sum([self.fixed, *self.parts], [1.0, *weights])
+        return self._evaluated(scales, *self._solved(scales))
+
+    def _solved(self, scales: Array) -> tuple[_Part, ChainSolution]:
+        """The weighted sum of all levels, and its solution."""
+        total = _sum([self.fixed, *self.parts], [1.0, *scales**-2.0])
         add_prior(total.chain, self.nodes_ns, self.errors)
         at = np.arange(self.k - self.parameters, self.k)
         total.chain.corner[at, at] += UNKNOWN_SIGMA**-2.0
-        found = solved(total.chain, total.gradient)
+        return total, solved(total.chain, total.gradient)
+
+    def _evaluated(self, scales: Array, total: _Part, found: ChainSolution) -> tuple[float, Array]:
+        """`at` a solution."""
+        weights = scales**-2.0
         cost = total.square + float(total.gradient @ found.step) + found.log_determinant
         slope = np.zeros(len(scales))
         moments = _second_moments(found)
@@ -248,7 +259,24 @@ class NoiseLikelihood:
     @cached_property
     def as_stated(self) -> tuple[float, Array]:
         """`at` the stated noise, where every fit begins."""
-        return self.at(np.ones(len(self.names)))
+        return self._evaluated(np.ones(len(self.names)), *self._solved_as_stated)
+
+    @cached_property
+    def curvatures(self) -> Array:
+        """(m,) second derivatives of `at` by the logarithms, about, at the stated noise.
+
+        Two for each row, less what the trajectory takes up of them: of 1446 rows of an
+        accelerometer 14 are left, of 723 of velocities 717.
+        """
+        found = self._solved_as_stated[1]
+        cov = Chain(found.cov, found.cov_next, found.cov_border, found.cov_corner)
+        none = np.zeros_like(found.step)
+        taken_up = [_expected(part, none, cov) - part.square for part in self.parts]
+        return 2.0 * (np.array([part.rows for part in self.parts]) - taken_up)
+
+    @cached_property
+    def _solved_as_stated(self) -> tuple[_Part, ChainSolution]:
+        return self._solved(np.ones(len(self.names)))
 
 
 def _sum(parts: Sequence[_Part], weights: Sequence[float]) -> _Part:
@@ -328,7 +356,11 @@ def fit(
     logarithms = np.zeros(len(likelihood.names))
     begin = likelihood.as_stated[0]
 
-    def cost(x: Array) -> tuple[float, Array]:
+    # In units of how well each is told: the search takes 6 steps instead of 20.
+    unit = np.sqrt(np.maximum(likelihood.curvatures[at], 0.0) + 2.0 / LOG_SPREAD**2)
+
+    def cost(scaled: Array) -> tuple[float, Array]:
+        x = scaled / unit
         logarithms[at] = x
         try:
             value, slope = likelihood.at(np.exp(logarithms)) if x.any() else likelihood.as_stated
@@ -336,18 +368,18 @@ def fit(
             if not x.any():
                 raise
             # Levels so far apart that numbers do not tell the states: the search turns back.
-            return TOO_FAR * (1.0 + float(x @ x)), 2.0 * TOO_FAR * x
+            return TOO_FAR * (1.0 + float(x @ x)), 2.0 * TOO_FAR * x / unit
         # Less the value at the start: the optimiser's tolerance is relative.
         return (
             value - begin + float(x @ x) / LOG_SPREAD**2,
-            slope[at] + 2.0 * x / LOG_SPREAD**2,
+            (slope[at] + 2.0 * x / LOG_SPREAD**2) / unit,
         )
 
     if not at:
         return {}, begin
     if begin <= enough:
         return dict.fromkeys(free, 1.0), begin
-    first = np.log([1.0 if start is None else start[name] for name in names])
+    first = unit * np.log([1.0 if start is None else start[name] for name in names])
     if start is not None and (value := cost(first)[0] + begin) <= enough:
         return {name: start[name] for name in names}, value
 
@@ -355,14 +387,15 @@ def fit(
         if intermediate_result.fun + begin <= enough:
             raise StopIteration
 
+    low, high = np.log(SCALE_BOUNDS).tolist()
     found = minimize(
         cost,
         first,
         jac=True,
         method="L-BFGS-B",
-        bounds=[tuple(np.log(SCALE_BOUNDS))] * len(at),
+        bounds=[(low * u, high * u) for u in unit.tolist()],
         callback=check,
-        options={"ftol": 1e-9, "gtol": 0.5, "maxiter": 30},
+        options={"ftol": 1e-6, "gtol": FIT_TOLERANCE, "maxiter": 30},
     )
-    scales = np.exp(np.asarray(found.x)).tolist()
+    scales = np.exp(np.asarray(found.x) / unit).tolist()
     return dict(zip(names, scales, strict=True)), float(found.fun) + begin

@@ -211,6 +211,7 @@ def test_levels_whose_likelihood_cannot_be_worked_out_are_no_end_of_the_fit() ->
     class Likelihood:
         names = ("gnss_horizontal", "velocity")
         best = np.array([0.4, -0.3])
+        curvatures = np.zeros(2)  # so that steps are too long
 
         def at(self, scales: Array) -> tuple[float, Array]:
             x = np.log(scales)

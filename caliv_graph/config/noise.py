@@ -17,6 +17,12 @@ class NoiseConfig(Section):
         "ground are off, 1 sigma; absent: integrated over or estimated, with the millimetres of "
         "data sheets as the prior",
     )
+    lidar_ground_tilt_deg: Positive | None = Field(
+        None,
+        description="degrees, 1 sigma of the tilt in which each LiDAR sees all ground of a drive "
+        "against the plane that carries the wheels; absent: none on roads, by its roughness on "
+        "grass and gravel",
+    )
     pose_position_m: Positive | None = Field(
         None,
         description="metres, white error of each given pose; absent: its message, or fitted",

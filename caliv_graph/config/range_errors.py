@@ -67,6 +67,7 @@ class RangeErrors:
         ground_m: 1 sigma of one more bias on the ground.
         surface_m: 1 sigma of one more bias on a surface, where nothing tells.
         beam_m: 1 sigma of one more bias of the beams at one elevation, where nothing tells.
+        ground_tilt_rad: 1 sigma of the tilt in which a LiDAR sees all ground; not metres.
     """
 
     offset_m: float | None = None
@@ -74,6 +75,7 @@ class RangeErrors:
     ground_m: float = GROUND_M
     surface_m: float = SURFACE_M
     beam_m: float = BEAM_M
+    ground_tilt_rad: float = 0.0
 
     @property
     def beams(self) -> tuple[float, ...]:
@@ -94,8 +96,14 @@ def range_errors(noise: NoiseConfig) -> RangeErrors:
     """The sizes that a config states; who knows all ranges knows those at a slant, too."""
     stated_m = noise.lidar_range_bias_m
     most_m = math.inf if stated_m is None else stated_m
-    usual = (INCIDENCE_M, GROUND_M, SURFACE_M, BEAM_M)
-    return RangeErrors(stated_m, *(min(usual_m, most_m) for usual_m in usual))
+    return RangeErrors(
+        offset_m=stated_m,
+        incidence_m=min(INCIDENCE_M, most_m),
+        ground_m=min(GROUND_M, most_m),
+        surface_m=min(SURFACE_M, most_m),
+        beam_m=min(BEAM_M, most_m),
+        ground_tilt_rad=math.radians(noise.lidar_ground_tilt_deg or 0.0),
+    )
 
 
 UNSTATED = RangeErrors()

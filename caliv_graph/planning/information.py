@@ -91,7 +91,7 @@ class Columns:
         return slice(at, at + 6)
 
     def biases(self, name: str) -> slice:
-        """Range biases of a LiDAR on the ground, those of `calibration.ground.bias_sigmas`."""
+        """What a LiDAR has in common on all ground, as `calibration.ground.bias_sigmas` has it."""
         at = self._biases + GROUND_BIASES * self.lidars.index(name)
         return slice(at, at + GROUND_BIASES)
 
@@ -351,8 +351,8 @@ def _seen_plane(
     # Predicted less measured: where the ground seems to rise, its normal leans back.
     changed = ground_by_range_bias(model)
     biases = _behind(columns.biases(name))
-    J[:, :2, biases] = R[:, :2, :2] @ changed[:2]
-    J[:, 2, biases] = changed[2]
+    J[:, :2, biases] = np.concatenate([R[:, :2, :2] @ changed[:2], tilt], axis=2)
+    J[:, 2, biases] = np.append(changed[2], np.zeros(3))
 
 
 def _add_contact(

@@ -39,6 +39,7 @@ class Nuisances:
             the beams fall, change along a wall slowly.
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
             from one place, beyond what `strip` has of it.
+        ground_tilt: tilt in which a LiDAR sees all level strips, rad; not metres.
         beams: (E,) of the errors of the beams of all LiDARs, as in `Layout.beams`: m, rad, rad,
             m/rad, rad/rad, by their kinds.
         jitter_s: of the stamp of each scan, s; 0: no such variables.
@@ -55,6 +56,7 @@ class Nuisances:
     strip_tilt: Array
     shared: float
     repeated: float
+    ground_tilt: float = 0.0
     beams: Array = field(default_factory=lambda: np.zeros(0))
     bend: Array = field(default_factory=lambda: np.zeros(0))
     jitter_s: float = 0.0
@@ -108,7 +110,8 @@ class Layout:
     In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
     were moved (`rates`, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth
     with incidence, and that on the ground (3), errors of the beams of each LiDAR, if they err
-    (kind by kind, of each all nodes), error of the vehicle's height and tilt above the ground (3),
+    (kind by kind, of each all nodes), tilt in which each LiDAR sees the ground, if it is rough (3,
+    lidar axes), error of the vehicle's height and tilt above the ground (3),
     errors of the angular velocity within the scans at each pose, if there are any (3), jitter of
     the stamp of each scan, if there is any; and what belongs to one surface each: planes (two
     tilts, offset), bends of each strip, if they are bent (`BENDS` times K), bias of each LiDAR on
@@ -125,6 +128,7 @@ class Layout:
     turns: int = 0
     beams: tuple[BeamErrors, ...] = ()
     bent: bool = False
+    ground_tilts: int = 0
 
     @property
     def strips(self) -> int:
@@ -174,6 +178,11 @@ class Layout:
     @property
     def standing(self) -> int:
         """Error of the vehicle's height above ground, and the two of its tilt."""
+        return self.ground_tilt + self.ground_tilts
+
+    @property
+    def ground_tilt(self) -> int:
+        """First tilt in which a LiDAR sees the ground; after the errors of the beams."""
         return self.beam + sum(errors.size for errors in self.beams)
 
     @property
@@ -214,6 +223,7 @@ class Layout:
             [
                 np.tile(of_lidar, self.lidars),
                 nuisances.beams,
+                np.full(self.ground_tilts, nuisances.ground_tilt),
                 np.tile(nuisances.bend, BENDS * self.bent),
                 np.full(self.lidars * self.surfaces, nuisances.surface),
                 np.tile(nuisances.strip, self.lidars),

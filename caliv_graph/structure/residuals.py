@@ -260,6 +260,11 @@ def geometry_of(
         of_beams += np.einsum("qc,qci->qi", state.errors[own], beams.by)
         parts.append(beams.by)
         columns.append(own)
+    if layout.ground_tilts:
+        own = layout.ground_tilt + 3 * lidar[:, None] + np.arange(3)
+        ground = normal[:, 2] > LEVEL
+        by_tilt = np.where(ground[:, None, None], by_extrinsic[:, :3], 0.0)
+        moved.append((by_tilt, own, state.errors[own]))
     if layout.bent:
         own = layout.bend + layout.strips * np.arange(BENDS) + strip[:, None]
         bends = np.zeros((q, BENDS, 4)) if sightings.bends is None else sightings.bends

@@ -41,13 +41,26 @@ def standing_sentence(moved_m: float, turned_deg: float, lasts_s: float) -> str:
     )
 
 
-def rough_ground_sentence(drive: str, roughness_m: float, sigma_m: float, used_m: float) -> str:
-    """The warning that the ground seen may not be what carries the wheels; sigmas of the height."""
+def rough_ground_sentence(
+    drive: str, roughness_m: float, stated_m: float | None, used_m: float, tilt_rad: float
+) -> str:
+    """The warning that the ground seen may not be what carries the wheels.
+
+    `stated_m` is 1 sigma of the height as stated, None if no height is; `used_m` in its place;
+    `tilt_rad` of each LiDAR's ground.
+    """
+    height, better = "", "roll and pitch"
+    if stated_m is not None:
+        height = (
+            f"ground.vehicle_height is believed to {1e3 * used_m:.0f} mm in place of ground.sigma "
+            f"({1e3 * stated_m:.3g} mm), and z of all LiDARs with it; "
+        )
+        better = "roll, pitch and z"
     return (
         f"{drive}: the ground scatters by {1e3 * roughness_m:.0f} mm from point to point, as grass "
-        "or gravel does: LiDARs see its tips, wheels sink in. ground.vehicle_height is believed to "
-        f"{1e3 * used_m:.0f} mm in place of ground.sigma ({1e3 * sigma_m:.3g} mm), and z of all "
-        "LiDARs with it, in all drives. For z use drives on asphalt or concrete alone"
+        f"or gravel does: LiDARs see its tips, wheels sink in. {height}each LiDAR's ground is "
+        f"believed to {1e3 * tilt_rad:.2f} mrad of tilt, in all drives. For {better} use drives on "
+        "asphalt or concrete alone"
     )
 
 

@@ -22,6 +22,7 @@ from caliv_graph.calibration.graph import (
     prior_graph,
 )
 from caliv_graph.calibration.ground import (
+    GROUND_BIASES,
     GroundWeights,
     full_weights,
     ground_centre,
@@ -289,7 +290,9 @@ def test_jacobians(offset_m: float) -> None:
         check_jacobians(ground_plane_factor((X, E, S), G, anchor, observation), values)
         check_jacobians(ground_plane_factor((X, E), G, anchor, observation, 0.3), values)
         biased = replace(observation, by_range_bias=np.random.default_rng(seed).normal(size=(3, 3)))
-        values.insert(key_ground_bias(0), np.array([0.01, -0.02, 0.03]))
+        values.insert(
+            key_ground_bias(0), 0.01 * np.random.default_rng(seed).normal(size=GROUND_BIASES)
+        )
         check_jacobians(
             ground_plane_factor((X, E, S), G, anchor, biased, key_bias=key_ground_bias(0)), values
         )
@@ -909,3 +912,31 @@ def test_scans_of_one_place_know_the_waves_of_the_ground_as_one_does(scans: int)
     assert squares(alike) == pytest.approx(squares([one]), rel=1e-6)
     # Before the waves are known, a view counts as four scans at most.
     assert 2.0 < squares([replace(o, repeated=None) for o in alike]) / squares([one]) < 4.0
+
+
+def test_on_grass_planes_tell_roll_and_pitch_no_better_than_each_lidar_sees_its_tilt() -> None:
+    """A turn of all ground that a LiDAR sees is one of the LiDAR, however many scans there are."""
+    case = make_case(count=40)
+    g = np.array([0.0, 0.0, GROUND_Z])
+    seen = [
+        replace(o, by_range_bias=np.zeros((3, 3))) for o in observed(case.problem, case.truth, g)
+    ]
+    config = GroundConfig(use=True)
+    values = gtsam.Values(case.truth)
+    values.insert(ground_values(case.problem, seen, values, config))
+    base = merged(
+        pose_graph(case.problem, PoseNoise(1e-4, 1e-3, 1e-5, 1e-4, 4.0)),
+        prior_graph(case.problem, case.problem.lidars),
+    )
+
+    def level_rad(tilt_rad: float) -> Array:
+        """1 sigma of the second LiDAR against the first about two level axes."""
+        ranges = RangeErrors(ground_tilt_rad=tilt_rad)
+        graph = merged(base, ground_graph(case.problem, seen, config, ranges=ranges))
+        S = case.problem.extrinsic_keys_of("front")[-1]
+        cov = gtsam.Marginals(graph, values).marginalCovariance(S)[:3, :3]
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(cov)[:2]))
+
+    on_road, on_grass = level_rad(0.0), level_rad(1e-3)
+    assert on_road.max() < 5e-4
+    assert on_grass == pytest.approx(np.hypot(on_road, math.sqrt(2.0) * 1e-3), rel=0.02)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.config.model import Config
-from caliv_graph.pipeline.preparation import LIFT, ROUGH_M, _on_rough_ground
+from caliv_graph.pipeline.preparation import LIFT, ROUGH_M, TILT_PER_M, _on_rough_ground
 from caliv_graph.products import Array, Recording
 from caliv_graph.structure.noise import roughness_m
 from caliv_graph.structure.patches import DrivePatches
@@ -43,11 +43,13 @@ class Named:
     name = "meadow"
 
 
-def prepared(patches: DrivePatches, **ground: object) -> tuple[float, tuple[str, ...]]:
-    """Sigma of the height that is used, and what is said."""
+def prepared(
+    patches: DrivePatches, **ground: object
+) -> tuple[float, float | None, tuple[str, ...]]:
+    """Sigmas of the height and of the LiDARs' tilt (degrees) that are used, and what is said."""
     recordings = [cast("Recording", Named())]
     config, said = _on_rough_ground(config_of(**ground), recordings, [patches], [TRAJECTORY])
-    return config.ground.sigma, said
+    return config.ground.sigma, config.noise.lidar_ground_tilt_deg, said
 
 
 @pytest.mark.parametrize("rough_m", [0.0, 0.005, 0.02])
@@ -68,22 +70,30 @@ def test_the_ground_is_as_rough_as_the_lidar_says_that_sees_the_least_of_it() ->
 
 
 def test_on_grass_the_height_is_believed_less_and_it_is_said() -> None:
-    used_m, (said,) = prepared(on_grass(TRUTH), vehicle_height=0.3, sigma=0.005)
+    used_m, tilt_deg, (said,) = prepared(on_grass(TRUTH), vehicle_height=0.3, sigma=0.005)
     assert used_m == pytest.approx(math.hypot(0.005, LIFT * GRASS_M), rel=0.15)
+    assert tilt_deg is not None
+    assert tilt_deg == pytest.approx(math.degrees(TILT_PER_M * GRASS_M), rel=0.15)
     assert "meadow: the ground scatters by" in said
     assert f"to {1e3 * used_m:.0f} mm in place of ground.sigma (5 mm)" in said
+    assert f"to {1e3 * math.radians(tilt_deg):.2f} mrad of tilt" in said
+
+
+def test_without_a_height_grass_tilts_alone() -> None:
+    used_m, tilt_deg, (said,) = prepared(on_grass(TRUTH), sigma=0.005)
+    assert (used_m, tilt_deg is None) == (0.005, False)
+    assert "vehicle_height" not in said
+    assert "roll and pitch use drives on asphalt" in said
 
 
 @pytest.mark.parametrize(
     ("seeing", "ground"),
     [
         ([], {"vehicle_height": 0.3}),
-        (TRUTH, {}),
         (TRUTH, {"vehicle_height": 0.3, "use": False}),
     ],
-    ids=["asphalt", "no height", "no ground"],
+    ids=["asphalt", "no ground"],
 )
 def test_else_nothing_changes(seeing: Collection[str], ground: dict[str, object]) -> None:
-    used_m, said = prepared(on_grass(seeing), sigma=0.004, **ground)
-    assert (used_m, said) == (0.004, ())
+    assert prepared(on_grass(seeing), sigma=0.004, **ground) == (0.004, None, ())
     assert ROUGH_M < GRASS_M

@@ -30,6 +30,7 @@ LAYOUT = Layout(
     jitters=2,
     rates=RATES,
     bent=True,
+    ground_tilts=6,
 )
 LIDAR = np.array([0, 1, 1, 0])
 POSE = np.array([0, 0, 1, 1])
@@ -42,8 +43,11 @@ def state_of(rng: np.random.Generator) -> State:
     poses = [gtsam.Pose3.Expmap(v) for v in rng.uniform(-0.3, 0.3, (2, 6))]
     R, t = stack(poses)
     normals = rng.standard_normal((3, 3))
+    normals[0] = [0.05, -0.1, 1.0]  # ground
     errors = np.zeros(LAYOUT.size)
-    errors[LAYOUT.error :] = 0.01 * rng.standard_normal(LAYOUT.size - LAYOUT.error)
+    drawn = 0.01 * rng.standard_normal(LAYOUT.size - LAYOUT.error - LAYOUT.ground_tilts)
+    tilts_rad = np.linspace(-1e-3, 1e-3, LAYOUT.ground_tilts)
+    errors[LAYOUT.error :] = np.insert(drawn, LAYOUT.ground_tilt - LAYOUT.error, tilts_rad)
     errors[LAYOUT.jitter : LAYOUT.plane] *= 0.1  # milliseconds
     errors[LAYOUT.plane : LAYOUT.bend] = 0.0
     return State(
@@ -111,6 +115,7 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
         (LAYOUT.offset, 1),
         (LAYOUT.extrinsic, 12),
         (LAYOUT.error, 6),
+        (LAYOUT.ground_tilt, 6),
         (LAYOUT.jitter, 2),
         (LAYOUT.plane, LAYOUT.size - LAYOUT.plane),
     ],

@@ -76,7 +76,9 @@ _SAME_WALLS = (
     "or pass them in both directions"
 )
 _SAME_GROUND = (
-    "use the ground (ground.use), if all of these LiDARs see it: upright walls do not determine z"
+    "use the ground (ground.use), if all of these LiDARs see it, and on wheels set "
+    "ground.vehicle_height, a rough one with a large ground.sigma if need be: upright walls do not "
+    "determine z"
 )
 
 OF_TARGET = _remedies(

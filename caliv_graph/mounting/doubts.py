@@ -25,7 +25,7 @@ from caliv_graph.products import Array, Recording
 from caliv_graph.targets.search.find import scans_to_read
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 
-Kind = Literal["exchanged", "turned", "framed", "upside_down", "heading", "mirrored", "left_handed"]
+Kind = Literal["exchanged", "turned", "upside_down", "heading", "mirrored", "left_handed"]
 
 SHARPER = 1.6
 """Times as many points at one place from which a mistake is said. Measured on an arc and an S-curve
@@ -39,9 +39,6 @@ wrong as well, had 1.3 and 2.0; one of them alone seemed turned by 90 degrees, w
 ALIKE = 0.9
 """Explanations that sharpen the maps nearly as much: then the one whose guesses are nearer holds.
 On an arc a mounting may turn about the centre of the arc."""
-
-OF_GUESSES = ("exchanged", "turned", "framed", "upside_down")
-"""Kinds that are the same in every drive."""
 
 HANGS_M = 0.4
 """Largest difference between the height of a LiDAR by its guess and by the ground, if it hangs."""
@@ -61,7 +58,6 @@ class Doubt:
         drive: index of the drive that shows it.
         name: of its recording.
         kind: `exchanged`: two LiDARs have each other's guess. `turned`: the guess of one is.
-            `framed`: the clouds of one are in the frame of another, or of the vehicle, already.
             `upside_down`: the same about an axis of the LiDAR that lies in its horizon.
             `heading`: that of the vehicle is, against its path. `mirrored`: the path turns right
             where the vehicle turned left, or all clouds are left-handed, which looks the same.
@@ -72,7 +68,6 @@ class Doubt:
         sharing: points that share a cell (`sharpness.sharpest_near`), now and without the mistake,
             of each of `lidars`.
         given: whether poses were given.
-        frame: the LiDAR in whose frame clouds are that are `framed`; empty: in that of the vehicle.
     """
 
     drive: int
@@ -82,7 +77,6 @@ class Doubt:
     turn_deg: int
     sharing: Mapping[str, tuple[float, float]]
     given: bool
-    frame: str = ""
 
 
 @dataclass(frozen=True)
@@ -92,7 +86,6 @@ class _Trial:
     kind: Kind
     turn_deg: int
     T_vehicle_lidar: Mapping[str, gtsam.Pose3]
-    frame: str = ""
 
     def undone(self, view: View) -> View:
         """What a LiDAR sees without the mistake."""
@@ -131,7 +124,7 @@ def doubts(
         views = _views(recording, trajectory, config, names, progress)
         doubt = _of_drive(drive, recording.name, views, config, given, blamed)
         if doubt is not None:
-            of = () if doubt.kind in OF_GUESSES else (drive,)
+            of = () if doubt.kind in ("exchanged", "turned", "upside_down") else (drive,)
             found.setdefault((doubt.kind, doubt.lidars, *of), doubt)
     return tuple(found.values())
 
@@ -186,8 +179,7 @@ def _of_drive(
         return None
     _, _, trial, then = best
     sharing = {n: (now[n], then[n]) for n in then}
-    of = tuple(then), trial.turn_deg, sharing, given, trial.frame
-    return Doubt(drive, name, trial.kind, *of)
+    return Doubt(drive, name, trial.kind, tuple(then), trial.turn_deg, sharing, given)
 
 
 def _hangs(guess: gtsam.Pose3, view: View, config: Config) -> bool:
@@ -242,10 +234,6 @@ def _trials(guesses: Mapping[str, gtsam.Pose3], given: bool) -> Iterator[_Trial]
         for name, T in guesses.items():
             alone = gtsam.Pose3(back.compose(T.rotation()), T.translation())
             yield _Trial("turned", turn, {name: alone})
-    for frame, T in (("", gtsam.Pose3()), *guesses.items()):
-        for name in names:
-            if name != frame:
-                yield _Trial("framed", 0, {name: T}, frame)
     if not guesses:
         return
     for turn in QUARTERS:

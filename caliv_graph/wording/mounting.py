@@ -98,14 +98,6 @@ def _mistake(found: Doubt, config: Config) -> tuple[str, str, str]:
             "Without this turn",
             f"Set lidars.{name}.initial.rpy_deg to about [{roll:.1f}, {pitch:.1f}, {right:.1f}]",
         )
-    if found.kind == "framed":
-        frame = f"the frame of lidar '{found.frame}'" if found.frame else "the vehicle frame"
-        return (
-            f"the clouds of lidar {names[0]} are in {frame} already, moved there by a driver or a "
-            "node",
-            "With the mounting of that frame",
-            f"Give the clouds of {names[0]} as it measures them",
-        )
     if found.kind == "heading":
         return (
             f"the heading of the vehicle is turned by {_turn(found)}",

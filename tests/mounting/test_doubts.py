@@ -135,19 +135,6 @@ def test_a_ceiling_is_no_ground_of_a_lidar_whose_guess_nothing_contradicts() -> 
         assert doubt.kind != "upside_down"
 
 
-@pytest.mark.parametrize(("frame", "T"), [("front", FRONT), ("", gtsam.Pose3())])
-def test_clouds_that_are_in_another_frame_already(frame: str, T: gtsam.Pose3) -> None:
-    """A driver that moves the clouds of the rear LiDAR; the vehicle frame is 1 m above ground."""
-    up = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 1.0]))
-    at = T if frame else up
-    drive = replace(DRIVE, mountings={"front": FRONT, "rear": at})
-    (doubt,) = doubts([drive], [DRIVE.way], GUESSES, SilentProgress())
-    assert (doubt.kind, doubt.lidars, doubt.frame) == ("framed", ("rear",), frame)
-    text = mistake_sentence(doubt, GUESSES)
-    named = "the frame of lidar 'front'" if frame else "the vehicle frame"
-    assert f"the clouds of lidar 'rear' are in {named} already" in text
-
-
 def test_a_heading_that_points_backwards() -> None:
     back = gtsam.Pose3(gtsam.Rot3.Yaw(math.pi), np.zeros(3))
     way = along(*(T.compose(back) for T in DRIVE.way.trajectory.T_map_vehicle))

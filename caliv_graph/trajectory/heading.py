@@ -249,7 +249,4 @@ def _turn_between(seen: Array, expected: Array, axis_only: bool) -> float:
 
 def _heading_sigma(smoothed: SmoothedTrajectory) -> float:
     """1 sigma of the mean heading, taken as that of a single one: errors common to all remain."""
-    cov = smoothed.trajectory.cov
-    if cov is None or not len(cov):
-        return 0.0
-    return float(np.sqrt(np.median(cov[:, 2, 2])))
+    return float(smoothed.pose_sigmas[2])

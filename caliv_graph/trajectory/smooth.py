@@ -121,6 +121,7 @@ def smooth_trajectory(
         warnings=tuple(warnings),
         noise_sources=noise_sources(data),
         nodes_ns=nodes,
+        pose_sigmas=np.sqrt(np.median(np.diagonal(last.cov, axis1=1, axis2=2), axis=0)),
         states=estimate.states,
         T_vehicle_imu=data.T_vehicle_imu,
         gravity_m_s2=data.gravity_m_s2,

@@ -99,6 +99,8 @@ class SmoothedTrajectory:
         warnings: about data that were left out or look wrong, a line each.
         noise_sources: sensor -> where its noise figures are from.
         nodes_ns: (n,) stamps of the nodes.
+        pose_sigmas: (6,) 1 sigma of the vehicle's pose, right perturbation, rotation then
+            translation, rad and m, median over the nodes: known where no stamp is wanted, too.
         states: estimates at the nodes.
         T_vehicle_imu: extrinsic that was used.
         gravity_m_s2: magnitude that was used, along -z of the map.
@@ -125,6 +127,7 @@ class SmoothedTrajectory:
     warnings: tuple[str, ...]
     noise_sources: Mapping[str, str]
     nodes_ns: IntArray
+    pose_sigmas: Array
     states: States
     T_vehicle_imu: gtsam.Pose3
     gravity_m_s2: float

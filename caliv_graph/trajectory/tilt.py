@@ -142,6 +142,8 @@ def _as_configured(trajectory: VehicleTrajectory) -> Array:
 
 def _attitude_cov(trajectory: VehicleTrajectory) -> Array:
     """(2, 2) of a pose's pitch and roll, taken as common to the drive; zero if unknown."""
+    if isinstance(trajectory, SmoothedTrajectory):
+        return np.diag(trajectory.pose_sigmas[[1, 0]] ** 2)
     cov = trajectory.trajectory.cov
     known = None if cov is None else cov[stated(cov)]
     if known is None or not len(known):

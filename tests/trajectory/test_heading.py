@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from caliv_graph.products import MotionData
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.tilt import vehicle_tilt
 from tests.trajectory.motions import (
     Course,
     Sensors,
@@ -93,10 +95,31 @@ def test_driving_backwards_is_no_disagreement() -> None:
 
 
 def test_a_heading_from_north_is_told_before_any_scan_has_a_pose() -> None:
-    """Without wanted stamps no covariance is known; its sigma is never zero."""
     sensors = replace(Sensors(), yaw_bias_rad=math.radians(80.0))
     motion = record(EIGHT, sensors, 1)
     found = heading_disagreement(smooth_trajectory(motion, config_for(sensors), ()), motion)
     assert found is not None
     assert found.sigma_rad > 0.0
     assert "against the path of the GNSS fixes" in found.warning
+
+
+@pytest.mark.parametrize("wanted_hz", [0.0, 1.0], ids=["no-stamps", "some-stamps"])
+def test_heading_and_tilt_have_the_sigma_of_the_poses_whichever_are_wanted(
+    wanted_hz: float,
+) -> None:
+    """Before any scan is looked at no stamps are wanted: poses are as uncertain as later."""
+    sensors, config = mounted_askew(), config_for(mounted_askew())
+    motion = replace(record(EIGHT, sensors, 1), twist=None)
+    every = smooth_trajectory(motion, config, stamps(EIGHT.duration_s, 10.0))
+    some = stamps(EIGHT.duration_s, wanted_hz) if wanted_hz else ()
+    few = smooth_trajectory(motion, config, some)
+
+    assert every.trajectory.cov is not None
+    sigmas = np.sqrt(np.median(np.diagonal(every.trajectory.cov, axis1=1, axis2=2), axis=0))
+    assert few.pose_sigmas == pytest.approx(sigmas, rel=0.1)
+    expected, found = heading_disagreement(every, motion), heading_disagreement(few, motion)
+    assert expected is not None
+    assert found is not None
+    assert found.sigma_rad == pytest.approx(expected.sigma_rad, rel=0.1)
+    tilts = [vehicle_tilt(each, "drive", config).sigma_rad for each in (every, few)]
+    assert tilts[1] == pytest.approx(tilts[0], rel=0.1)

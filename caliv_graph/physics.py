@@ -90,12 +90,13 @@ def smoothed_findings(
     """
     out: list[Finding] = []
     for index, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
+        lies = False
         if not _is_of_wheels(trajectory):
             tilt = vehicle_tilt(trajectory, motions[index].name, config)
-            found = tilt_finding(tilt, config)
+            found, lies = tilt_finding(tilt, config), tilt.lies
             if found is not None:
                 out.append(found)
-        if config.ground.use:
+        if config.ground.use and not lies:
             grounds = lidar_grounds(recording, trajectory, config, progress)
             out += guess_findings(recording.name, misfits(grounds, config), config)
     return tuple(out)

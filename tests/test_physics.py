@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from types import SimpleNamespace
+from typing import Literal, cast
 
+import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.model import Config
 from caliv_graph.errors import TargetError, TrajectoryError
 from caliv_graph.physics import (
     clock_findings,
@@ -15,11 +19,22 @@ from caliv_graph.physics import (
     contradictions_of,
     raise_fatal,
     ranked_with,
+    smoothed_findings,
     warnings_of,
     with_cause,
     without_effects,
 )
-from caliv_graph.products import Finding, StructureTerm, Suspect, VehicleParameter
+from caliv_graph.products import (
+    Finding,
+    MotionData,
+    Recording,
+    StructureTerm,
+    Suspect,
+    Trajectory,
+    VehicleParameter,
+)
+from caliv_graph.targets.ground.guesses import LidarGround
+from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.wording.offsets import late_clock_sentences
 from tests.samples import make_calibration
 
@@ -165,3 +180,32 @@ def test_clocks_of_lidars_are_compared_with_each_other() -> None:
     both = replace(apart(rear=20.0), clocks={"front": (0.0, 1e-3), "rear": (0.02, 1e-3)})
     (alone,) = clock_findings(["drive"], [both], calm)
     assert "and 'rear'" not in alone.sentence
+
+
+@pytest.mark.parametrize(
+    ("rpy_deg", "asked"), [((-90.0, 0.0, -90.0), []), ((0.0, 0.0, 0.0), ["drive"])]
+)
+def test_a_vehicle_on_its_side_has_no_height(
+    rpy_deg: tuple[float, float, float], asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Poses of a camera seemed to ask for a vehicle_height of 31 m."""
+    seen: list[str] = []
+
+    def grounds(recording: Recording, *_: object) -> tuple[LidarGround, ...]:
+        seen.append(recording.name)
+        return ()
+
+    monkeypatch.setattr("caliv_graph.physics.lidar_grounds", grounds)
+    t = np.arange(0.0, 30.0, 0.1)
+    R = gtsam.Rot3.RzRyRx(*np.radians(rpy_deg).tolist())
+    poses = [gtsam.Pose3(gtsam.Rot3.Rz(0.2 * s).compose(R), [2.0 * s, 0.0, 0.0]) for s in t]
+    trajectory = GivenTrajectory(Trajectory((1e9 * t).astype(np.int64), tuple(poses)))
+    recording = cast("Recording", SimpleNamespace(name="drive"))
+    config = Config.model_validate({"lidars": {"a": {"topic": "/a"}}})
+
+    found = smoothed_findings(
+        [recording], [trajectory], {0: MotionData("drive")}, config, SilentProgress()
+    )
+
+    assert seen == asked
+    assert ("roll -90" in "".join(each.sentence for each in found)) == (not asked)

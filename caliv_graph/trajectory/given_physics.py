@@ -31,6 +31,9 @@ in curves, in any convention that is right."""
 MAX_OFF_RAD = math.radians(20.0)
 """Mean angle between course and heading, from which another convention is looked for."""
 
+SAME_RAD = 1e-6
+"""Difference of two deviations that rounding explains: a turn about z changes none."""
+
 STEP_M = 1.0
 """Way over which the course is taken."""
 
@@ -81,9 +84,16 @@ class Stance:
         return self.upright and not self.strays and self.aside_rad < MAX_OFF_RAD
 
     def mends(self, other: Stance) -> bool:
-        """Whether a vehicle stands and goes so, and did not by the other stance."""
+        """Whether a vehicle stands and goes so, and did not by the other stance.
+
+        A frame ahead of the rear axle deviates in curves in every convention. That is no reason
+        against one that puts a vehicle on its wheels, or only turns it.
+        """
         if not self.upright or not abs(self.off_rad) < MAX_OFF_RAD:
             return False
+        turns = abs(self.spread_rad - other.spread_rad) < SAME_RAD
+        if not other.upright or turns:
+            return self.spread_rad < MAX_OFF_RAD
         return self.spread_rad <= max(MENDED * other.spread_rad, MIN_SPREAD_RAD * MENDED)
 
 
@@ -111,6 +121,8 @@ def _file_order(R: Array, t: Array) -> tuple[Array, Array]:
 
 
 _DOWN = np.diag([1.0, -1.0, -1.0])
+_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_RIGHT_AHEAD = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _NORTH_EAST = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 READINGS: dict[str, Callable[[Array, Array], tuple[Array, Array]]] = {
@@ -122,10 +134,15 @@ READINGS: dict[str, Callable[[Array, Array], tuple[Array, Array]]] = {
     "y": lambda R, t: (R, t * [1.0, -1.0, 1.0]),
     "x": lambda R, t: (R, t * [-1.0, 1.0, 1.0]),
     "xy": lambda R, t: (R, t[:, [1, 0, 2]]),
+    "camera": lambda R, t: (R @ _CAMERA.T, t),
+    "camera_map": lambda R, t: (_CAMERA @ R @ _CAMERA.T, t @ _CAMERA.T),
+    "rfu": lambda R, t: (R @ _RIGHT_AHEAD.T, t),
 }
 """What may have been meant, and rotations (n, 3, 3) and positions (n, 3) read so: quaternions as w
 x y z; vehicles with z down; maps with z down; the map in the vehicle; rotations of north, east,
-down with positions of east, north, up; y or x the other way; x and y exchanged."""
+down with positions of east, north, up; y or x the other way; x and y exchanged; a camera with x to
+the right, y down, z ahead, in a map with z up or in one with the same axes; vehicles with x to the
+right and y ahead."""
 
 
 def poses_physics(motion: MotionData) -> PosesPhysics | None:

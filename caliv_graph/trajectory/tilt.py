@@ -15,6 +15,7 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array
+from caliv_graph.trajectory.given_physics import MAX_TILT_RAD
 from caliv_graph.trajectory.imu import exp_so3
 from caliv_graph.trajectory.noise import stated
 from caliv_graph.trajectory.parameters import IMU_ROTATION
@@ -64,6 +65,18 @@ class VehicleTilt:
     roll_pitch_rad: Array
     sigma_rad: Array
     given: bool
+
+    @property
+    def up_vehicle(self) -> Array:
+        """(3,) the vertical in the vehicle's axes."""
+        roll, pitch = self.roll_pitch_rad.tolist()
+        level = math.cos(pitch)
+        return np.array([-math.sin(pitch), math.sin(roll) * level, math.cos(roll) * level])
+
+    @property
+    def lies(self) -> bool:
+        """Whether the vehicle's axes lie on a side: no height and no level ground is below them."""
+        return bool(self.up_vehicle[2] < math.cos(MAX_TILT_RAD))
 
 
 def body_sigma_rad(config: Config) -> float:
@@ -119,10 +132,11 @@ def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> Ve
     cov = cov + _attitude_cov(trajectory)
     body = body_sigma_rad(config)
     x, y = found[:2]
+    z = float(np.median(up[:, 2]))
     # Nose up: up leans along +x in vehicle axes, which is a negative pitch; left side up: +y, roll.
     return VehicleTilt(
         name=name,
-        roll_pitch_rad=np.array([y, -x]),
+        roll_pitch_rad=np.array([math.atan2(y, z), -math.atan2(x, math.hypot(y, z))]),
         sigma_rad=np.sqrt(np.array([cov[1, 1], cov[0, 0]]) + body**2),
         given=not isinstance(trajectory, SmoothedTrajectory),
     )

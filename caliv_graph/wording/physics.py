@@ -31,7 +31,7 @@ from caliv_graph.trajectory.physics import (
     Ratio,
     known_rotation,
 )
-from caliv_graph.trajectory.tilt import VehicleTilt
+from caliv_graph.trajectory.tilt import VehicleTilt, body_sigma_rad
 from caliv_graph.uncertainty.consistency import CONTRADICTION_P, CONTRADICTION_SIGMAS
 from caliv_graph.wording.mounting import pose_key
 
@@ -60,6 +60,10 @@ SMALL_RATIO = 0.05
 
 MIN_DELAY_S = 0.1
 """A smaller clock offset is left to the solve: parabolas over 2 s do not resolve it safely."""
+
+SAID_TO_FOLLOW = 0.5
+"""Part of a deviation from the course that another reading of poses may leave, to be said with it.
+A frame ahead of the rear axle keeps all of it, in every reading."""
 
 KNOWN_PART = 0.1
 """A ratio this near to that of two units is taken for it."""
@@ -339,6 +343,21 @@ _READINGS = {
     "y": ("with y the other way", "Change the sign of y, so that the map is right-handed"),
     "x": ("with x the other way", "Change the sign of x, so that the map is right-handed"),
     "xy": ("with x and y exchanged", "Exchange them: east is x, and north is y"),
+    "camera": (
+        "as a camera's, x to the right, y down, z ahead",
+        "Give poses of the vehicle frame, x forward, y left, z up: those of the camera times "
+        "T_camera_vehicle, from the right",
+    ),
+    "camera_map": (
+        "as a camera's, x to the right, y down, z ahead, in a map with the same axes",
+        "Turn the map, so that its z is up, and give poses of the vehicle frame, x forward, y "
+        "left, z up: those of the camera times T_camera_vehicle, from the right",
+    ),
+    "rfu": (
+        "with x of the vehicle to the right and y ahead, or with yaw counted from north",
+        "Turn them by +90 degrees of yaw about the vehicle's z (x forward, y left), if the initial "
+        "guesses are not in these axes, too",
+    ),
 }
 """How given poses are read (`trajectory.given_physics.READINGS`), and what to do."""
 
@@ -363,7 +382,8 @@ def fast_finding(name: str, speed_m_s: float, config: Config) -> Finding:
 def poses_finding(found: PosesPhysics, config: Config) -> Finding:
     """Given poses of a vehicle that does not stand upright or not go where it points.
 
-    Axes with z down are a choice that guesses may share: then they are no contradiction.
+    Axes with z down, or x to the right, are a choice that guesses may share: then they are no
+    contradiction. Nor is a vehicle frame that the config says to lean.
     """
     now, then = found.now, found.then
     limits = [(now.tilt_rad, MAX_TILT_RAD)]
@@ -373,7 +393,7 @@ def poses_finding(found: PosesPhysics, config: Config) -> Finding:
             f"z of the vehicle is {math.degrees(now.tilt_rad):.0f} degrees from z of the map"
         )
         mended.append(f"{math.degrees(then.tilt_rad):.1f} degrees")
-    if now.strays:
+    if now.strays and then.spread_rad < SAID_TO_FOLLOW * now.spread_rad:
         limits.append((now.spread_rad, MIN_SPREAD_RAD))
         parts.append(
             "the direction of travel strays from where the vehicle points by "
@@ -392,13 +412,15 @@ def poses_finding(found: PosesPhysics, config: Config) -> Finding:
     if config.data.format == "caliv" and "frd" in found.readings:
         remedies = ("Convert them to a vehicle with x forward, y left, z up, in a map with z up",)
     off, limit = max(limits, key=lambda of: of[0] / of[1])
+    leans = not now.upright and now.tilt_rad < CONTRADICTION_SIGMAS * body_sigma_rad(config)
+    chosen = leans or not {"frd", "rfu"}.isdisjoint(found.readings)
     sigma = limit / CONTRADICTION_SIGMAS
     return Finding(
         "topics.pose",
         (),
         math.degrees(sigma),
         off / sigma,
-        "warning" if "frd" in found.readings else "fatal",
+        "warning" if chosen else "fatal",
         f"{found.name}: by the poses in {where}, {' and '.join(parts)} (median). Read "
         f"{' or '.join(ways)}, they have {' and '.join(mended)}. {'; or '.join(remedies)}",
     )
@@ -422,8 +444,7 @@ def tilt_finding(tilt: VehicleTilt, config: Config) -> Finding | None:
     key, remedy = "topics.pose", "check the frame of the poses"
     value: tuple[float, ...] = ()
     if not tilt.given and R is not None:
-        roll, pitch = tilt.roll_pitch_rad
-        value = _degrees(level(np.array([-pitch, roll, 1.0])) @ R)
+        value = _degrees(level(tilt.up_vehicle) @ R)
         key = "imu.T_vehicle_imu"
         remedy = f"imu.T_vehicle_imu rpy_deg about {_rpy(value, 1)} would fit"
     return Finding(

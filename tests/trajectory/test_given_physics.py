@@ -18,6 +18,8 @@ from caliv_graph.trajectory.given_physics import PosesPhysics, poses_physics
 
 NORTH_EAST = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 DOWN = np.diag([1.0, -1.0, -1.0])
+CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""(3, 3) from the axes of a camera, x to the right, y down, z ahead, to x forward, y left, z up."""
 CONFIG = {"lidars": {"a": {"topic": "/a"}}, "topics": {"pose": "/pose"}}
 
 
@@ -60,6 +62,16 @@ def other(reading: str) -> tuple[Array, Array]:
             return NORTH_EAST @ R @ DOWN, t
         case "y":
             return R, t * [1.0, -1.0, 1.0]
+        case "camera":
+            # 3 m ahead of the axle: in curves of 9 m it goes 18 degrees off where it looks.
+            R, t = s_curve(ahead_m=3.0)
+            return R @ CAMERA, t
+        case "camera_map":
+            R, t = s_curve(ahead_m=3.0)
+            return CAMERA.T @ R @ CAMERA, t @ CAMERA
+        case "rfu":
+            R, t = s_curve(ahead_m=3.0)
+            return R @ Rotation.from_euler("z", -90.0, degrees=True).as_matrix(), t
         case _:
             return R, t[:, [1, 0, 2]]
 
@@ -89,13 +101,17 @@ def test_a_short_way_tells_no_course() -> None:
     assert found(R[:3], t[:3]) is None
 
 
-@pytest.mark.parametrize("reading", ["wxyz", "inverse", "compass", "y", "xy"])
+@pytest.mark.parametrize(
+    "reading", ["wxyz", "inverse", "compass", "y", "xy", "camera", "camera_map"]
+)
 def test_poses_of_another_convention_stop_with_what_they_are(reading: str) -> None:
     R, t = other(reading)
     physics = found(R, t)
     assert physics is not None
     assert reading in physics.readings
-    assert math.degrees(physics.then.spread_rad) < 1.0
+    ahead = reading.startswith("camera")
+    assert math.degrees(physics.then.spread_rad) < (19.0 if ahead else 1.0)
+    assert not ahead or physics.readings == (reading,)
     config = Config.model_validate(CONFIG)
     findings = raw_findings({0: recorded(R, t)}, config)
     with pytest.raises(TrajectoryError, match=r"drive: by the poses in topics.pose, .*median"):
@@ -119,6 +135,23 @@ def test_a_frame_with_z_down_is_a_warning() -> None:
     assert finding.severity == "warning"
     assert "z of the vehicle is 177 degrees from z of the map" in finding.sentence
     assert "data.pose_axes: frd" in finding.sentence
+
+
+def test_a_vehicle_whose_y_is_ahead_is_a_warning() -> None:
+    """Guesses may be in the same axes."""
+    (finding,) = raw_findings({0: recorded(*other("rfu"))}, Config.model_validate(CONFIG))
+    assert finding.severity == "warning"
+    assert "the direction of travel is 90 degrees off where the vehicle points" in finding.sentence
+    assert "x of the vehicle to the right and y ahead" in finding.sentence
+
+
+def test_a_vehicle_frame_that_is_meant_to_lean_does_not_stop() -> None:
+    leaning = Config.model_validate({**CONFIG, "ground": {"parallel_sigma_deg": 30.0}})
+    (finding,) = raw_findings({0: recorded(*other("camera"))}, leaning)
+    assert finding.severity == "warning"
+    (finding,) = raw_findings({0: recorded(*other("camera"))}, Config.model_validate(CONFIG))
+    assert "z of the vehicle is 87 degrees from z of the map" in finding.sentence
+    assert "T_camera_vehicle, from the right" in finding.sentence
 
 
 def test_positions_in_millimetres_make_a_vehicle_that_is_too_fast() -> None:

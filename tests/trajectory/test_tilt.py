@@ -64,6 +64,20 @@ def test_in_reverse_the_climb_counts_backwards() -> None:
     assert found.roll_pitch_rad[1] == pytest.approx(0.02, abs=0.003)
 
 
+@pytest.mark.parametrize(
+    ("rpy_deg", "lies"),
+    [((-90.0, 0.0), True), ((180.0, 0.0), True), ((0.0, 60.0), True), ((0.0, -15.0), False)],
+)
+def test_a_large_angle_is_no_sine(rpy_deg: tuple[float, float], lies: bool) -> None:
+    """Poses of a camera, y down, were said to roll by one radian."""
+    roll, pitch = np.radians(rpy_deg).tolist()
+    found = vehicle_tilt(drive(0.0, True, (roll, pitch)), "drive", CONFIG)
+
+    off = np.remainder(found.roll_pitch_rad - [roll, pitch] + math.pi, 2.0 * math.pi) - math.pi
+    assert off == pytest.approx(np.zeros(2), abs=0.02)
+    assert found.lies == lies
+
+
 def leaning(*rpy_deg: float, parallel_sigma_deg: float | None = None) -> Config:
     """The config of a user who takes the IMU for turned by these angles."""
     mounted: dict[str, object] = {"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": [*rpy_deg, 0.0]}}

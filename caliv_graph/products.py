@@ -45,6 +45,21 @@ class LidarScan:
 
 
 @dataclass(frozen=True)
+class PoseFrame:
+    """The frame that given poses are of, where their messages name it.
+
+    Attributes:
+        name: of it.
+        vehicle: the vehicle frame of `/tf_static`; empty: it has none.
+        T_vehicle_frame: by `/tf_static`; None: the two are not connected there.
+    """
+
+    name: str
+    vehicle: str = ""
+    T_vehicle_frame: gtsam.Pose3 | None = None
+
+
+@dataclass(frozen=True)
 class GivenPoses:
     """Vehicle poses that came with the recording.
 
@@ -53,11 +68,13 @@ class GivenPoses:
         T_map_vehicle: n poses.
         cov: (n, 6, 6) as the messages state it, right perturbations, rotation then translation;
             NaN where unknown. None: nothing is stated.
+        frame: that they are of, and are taken for the vehicle's; None: nothing names it.
     """
 
     stamps_ns: IntArray
     T_map_vehicle: tuple[gtsam.Pose3, ...]
     cov: Array | None = None
+    frame: PoseFrame | None = None
 
 
 @dataclass(frozen=True)

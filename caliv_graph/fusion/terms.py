@@ -66,7 +66,7 @@ def drive_digest(motion: MotionData) -> str:
     return digest.hexdigest()
 
 
-_LATER = frozenset({"yaw_rate", "yaw_rate_var", "heading"})
+_LATER = frozenset({"yaw_rate", "yaw_rate_var", "heading", "frame"})
 """Fields that came after digests had been written: the rest tells one drive from another."""
 
 

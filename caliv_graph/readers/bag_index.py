@@ -154,7 +154,7 @@ def _read(
         records_ns={topic: array("q") for topic in topics},
         samples={topic: [] for topic in lidar_topics},
     )
-    trees = [c for c in collectors.values() if isinstance(c, TfCollector)]
+    trees = [c for c in collectors.values() if isinstance(c, TfCollector | PoseCollector)]
     also = {_STATIC_TOPIC} & set(bag.topics) if trees else set()
     for topic, record_ns, raw in bag.messages({*topics, *also}):
         try:

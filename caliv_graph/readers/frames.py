@@ -119,6 +119,14 @@ def pose_from_ros(translation: Any, rotation: Any) -> gtsam.Pose3 | None:
     return gtsam.Pose3(gtsam.Rot3.Quaternion(*(q / norm)), t)
 
 
+def pose_text(T: gtsam.Pose3) -> str:
+    """A pose as a config has it, to the centimetre and the tenth of a degree."""
+    xyz = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in T.translation())
+    angles = np.degrees(T.rotation().rpy())
+    rpy_deg = ", ".join(f"{round(value, 1) + 0.0:.1f}" for value in angles)
+    return f"xyz [{xyz}], rpy_deg [{rpy_deg}]"
+
+
 def read_urdf(path: Path) -> tuple[FrameTransform, ...]:
     """The fixed joints of a URDF. A link on a joint that moves has no fixed pose.
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -324,7 +325,10 @@ def in_vehicle_axes(poses: GivenPoses, axes: PoseAxes) -> GivenPoses:
     turned = tuple((C.compose(T) if axes == "ned" else T).compose(C) for T in poses.T_map_vehicle)
     signs = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
     cov = None if poses.cov is None else poses.cov * np.outer(signs, signs)
-    return GivenPoses(poses.stamps_ns, turned, cov)
+    frame = poses.frame
+    if frame is not None and frame.T_vehicle_frame is not None:
+        frame = replace(frame, T_vehicle_frame=frame.T_vehicle_frame.compose(C))
+    return replace(poses, T_map_vehicle=turned, cov=cov, frame=frame)
 
 
 def check_overlap(poses: GivenPoses, path: Path, span_ns: tuple[int, int], what: str) -> None:

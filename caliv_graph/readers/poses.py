@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from caliv_graph.products import Array, GivenPoses, IntArray
+from caliv_graph.products import Array, GivenPoses, IntArray, PoseFrame
 from caliv_graph.readers.collectors import (
     MOST_M,
     NORM_TOLERANCE,
@@ -19,7 +20,17 @@ from caliv_graph.readers.collectors import (
     covariances,
     or_none,
 )
-from caliv_graph.readers.frames import VEHICLE_FRAMES, FrameTransform, FrameTree, message_transforms
+from caliv_graph.readers.frames import (
+    VEHICLE_FRAMES,
+    FrameTransform,
+    FrameTree,
+    clean_frame,
+    message_transforms,
+    pose_text,
+)
+
+SAME_M, SAME_RAD = 0.01, math.radians(0.5)
+"""Two frames that are nearer are one: no vehicle frame is known better."""
 
 _SIDEWAYS_M = 1.0
 """Of a vehicle that always looks along x: poses that move farther along y hold no orientation."""
@@ -28,13 +39,25 @@ _SIDEWAYS_M = 1.0
 class PoseCollector(RowCollector):
     """`Odometry`, `PoseStamped` or `PoseWithCovarianceStamped`: the vehicle in the map.
 
-    The header's frame is taken for the map, the child frame of an odometry for the vehicle.
+    The header's frame is taken for the map, the child frame of an odometry for the vehicle
+    (`frame_sentence`).
     """
 
     _WIDTH = 43
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._children: set[str] = set()
+        self._static: dict[str, FrameTransform] = {}
+
+    def add_static(self, message: Any) -> None:
+        """Takes one message of `/tf_static`."""
+        for _, link in message_transforms(message):
+            self._static[link.child] = link
+
     def add(self, stamp_ns: int, message: Any) -> None:
         """Takes one message."""
+        self._children.add(clean_frame(getattr(message, "child_frame_id", "")))
         pose = message.pose
         cov = np.zeros(36)
         if hasattr(pose, "covariance"):
@@ -64,7 +87,34 @@ class PoseCollector(RowCollector):
         cov = or_none(covariances(rows[:, 7:]))
         if cov is not None:
             cov = right_perturbations(Rotation.from_quat(rows[:, 3:7]).as_matrix(), cov)
-        return GivenPoses(stamps, poses, cov)
+        return GivenPoses(stamps, poses, cov, self._frame())
+
+    def _frame(self) -> PoseFrame | None:
+        """The frame of the poses, if all messages name one that is not the vehicle's."""
+        if len(self._children) != 1:
+            return None
+        (name,) = self._children
+        if not name or name in VEHICLE_FRAMES:
+            return None
+        tree = FrameTree(self._static.values())
+        vehicle = tree.vehicle_frame() or ""
+        return PoseFrame(name, vehicle, tree.transform(vehicle, name) if vehicle else None)
+
+
+def frame_sentence(frame: PoseFrame) -> str:
+    """That poses are of a frame that `/tf_static` has elsewhere on the vehicle; or nothing."""
+    T = frame.T_vehicle_frame
+    if T is None:
+        return ""
+    turned_rad = float(np.linalg.norm(gtsam.Rot3.Logmap(T.rotation())))
+    if np.linalg.norm(T.translation()) < SAME_M and turned_rad < SAME_RAD:
+        return ""
+    return (
+        f"its poses are of the frame '{frame.name}', and are taken for those of the vehicle frame. "
+        f"By /tf_static, '{frame.name}' is at {pose_text(T)} in '{frame.vehicle}': if the initial "
+        f"guesses are in '{frame.vehicle}', give its poses, which are these times "
+        f"T_{frame.name}_{frame.vehicle} from the right, {pose_text(T.inverse())}"
+    )
 
 
 class TfCollector:

@@ -17,7 +17,7 @@ from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import PoseAxes, TopicsConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import RecordingError
-from caliv_graph.products import LidarScan, MotionData
+from caliv_graph.products import GivenPoses, LidarScan, MotionData
 from caliv_graph.readers.ahead import worked_ahead
 from caliv_graph.readers.bag import Bag, DamagedMessageError, Topic
 from caliv_graph.readers.bag_clouds import wanted_clouds
@@ -32,6 +32,7 @@ from caliv_graph.readers.pointcloud2 import (
     packets_hint,
 )
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses
+from caliv_graph.readers.poses import frame_sentence
 from caliv_graph.readers.stamps import StampMark
 from caliv_graph.readers.sweeps import (
     TimesSeen,
@@ -273,6 +274,7 @@ class RosbagRecording:
                 check_overlap(found["pose"], self._poses, span_ns, self._bag.name)
         if found.get("pose") is not None:
             found["pose"] = in_vehicle_axes(found["pose"], self._pose_axes)
+            self._warnings += self._elsewhere(found["pose"])
         motion = MotionData(
             self._bag.name,
             poses=found.get("pose"),
@@ -296,6 +298,11 @@ class RosbagRecording:
             if isinstance(taken, GnssCollector):
                 self._fixes[topic] = 0 if motion.gnss is None else len(motion.gnss.stamps_ns)
         return motion
+
+    def _elsewhere(self, poses: GivenPoses) -> list[str]:
+        """A line if the poses of the topic are of another frame than the vehicle's."""
+        said = "" if poses.frame is None else frame_sentence(poses.frame)
+        return [f"{self._bag.name}: topics.pose '{self._used['pose']}': {said}"] if said else []
 
     def _decoded(self, found: tuple[str, int, bytes]) -> tuple[int, DecodedCloud | str]:
         """Stamp and cloud, or the problem of its message. Changes no state: it runs in a thread."""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import stack
-from caliv_graph.products import Array, MotionData
+from caliv_graph.products import Array, MotionData, PoseFrame
 from caliv_graph.trajectory.odometry import OdometryPoses
 
 MAX_TILT_RAD = math.radians(20.0)
@@ -106,12 +106,14 @@ class PosesPhysics:
         now: as they are read.
         readings: the conventions in which they are (`READINGS`).
         then: in the first of them.
+        frame: that they are of, where messages name it.
     """
 
     name: str
     now: Stance
     readings: tuple[str, ...]
     then: Stance
+    frame: PoseFrame | None = None
 
 
 def _file_order(R: Array, t: Array) -> tuple[Array, Array]:
@@ -161,7 +163,7 @@ def poses_physics(motion: MotionData) -> PosesPhysics | None:
     # Of a vehicle that points where it goes the drive cannot tell z up from z down.
     best = min(then.spread_rad for then in sound.values())
     alike = {n: s for n, s in sound.items() if s.spread_rad <= best + MIN_SPREAD_RAD * MENDED}
-    return PosesPhysics(motion.name, now, tuple(alike), next(iter(alike.values())))
+    return PosesPhysics(motion.name, now, tuple(alike), next(iter(alike.values())), poses.frame)
 
 
 def impossible_speed(motion: MotionData) -> float | None:

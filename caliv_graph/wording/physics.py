@@ -12,6 +12,7 @@ import numpy as np
 
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, Finding
+from caliv_graph.readers.frames import pose_text
 from caliv_graph.targets.cloud.copies import Copy
 from caliv_graph.targets.ground.guesses import Misfit
 from caliv_graph.trajectory.alignment import level
@@ -415,14 +416,20 @@ def poses_finding(found: PosesPhysics, config: Config) -> Finding:
     leans = not now.upright and now.tilt_rad < CONTRADICTION_SIGMAS * body_sigma_rad(config)
     chosen = leans or not {"frd", "rfu"}.isdisjoint(found.readings)
     sigma = limit / CONTRADICTION_SIGMAS
+    of_frame, known = "", ""
+    if found.frame is not None:
+        of_frame = f" of the frame '{found.frame.name}'"
+    if found.frame is not None and found.frame.T_vehicle_frame is not None:
+        back = found.frame.T_vehicle_frame.inverse()
+        known = f". By /tf_static T_{found.frame.name}_{found.frame.vehicle} is {pose_text(back)}"
     return Finding(
         "topics.pose",
         (),
         math.degrees(sigma),
         off / sigma,
         "warning" if chosen else "fatal",
-        f"{found.name}: by the poses in {where}, {' and '.join(parts)} (median). Read "
-        f"{' or '.join(ways)}, they have {' and '.join(mended)}. {'; or '.join(remedies)}",
+        f"{found.name}: by the poses in {where}{of_frame}, {' and '.join(parts)} (median). Read "
+        f"{' or '.join(ways)}, they have {' and '.join(mended)}. {'; or '.join(remedies)}{known}",
     )
 
 

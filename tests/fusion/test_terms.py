@@ -11,7 +11,15 @@ from caliv_graph.config.guesses import FOUND_SIGMA
 from caliv_graph.errors import ConfigError
 from caliv_graph.fusion.terms import arranged, drive_digest, fuse, moved_to, own_term, slid
 from caliv_graph.geometry.se3 import retract_vehicle_axes, vehicle_axes_difference
-from caliv_graph.products import Array, DataTerm, GivenPoses, Guess, ImuSamples, MotionData
+from caliv_graph.products import (
+    Array,
+    DataTerm,
+    GivenPoses,
+    Guess,
+    ImuSamples,
+    MotionData,
+    PoseFrame,
+)
 from tests.drives_with_chair import RADIUS_M
 from tests.fusion.drives import TRUTH, arc_information, drive, information, moved, shift
 from tests.samples import turn_about_centre
@@ -202,4 +210,11 @@ def motion(name: str = "drive", seed: int = 1, poses: bool = False) -> MotionDat
 def test_the_digest_is_of_the_drive_not_of_its_name(poses: bool) -> None:
     assert drive_digest(motion("a", poses=poses)) == drive_digest(motion("b", poses=poses))
     assert drive_digest(motion(seed=1, poses=poses)) != drive_digest(motion(seed=2, poses=poses))
+
+
+def test_the_digest_is_without_the_name_of_the_frame_as_earlier_ones() -> None:
+    given = motion(poses=True)
+    assert given.poses is not None
+    framed = replace(given, poses=replace(given.poses, frame=PoseFrame("imu_link")))
+    assert drive_digest(framed) == drive_digest(given)
     assert drive_digest(motion(poses=True)) != drive_digest(motion(poses=False))

@@ -306,11 +306,12 @@ def odometry(
     velocity: Sequence[float] = (0.0, 0.0, 0.0),
     pose_cov: Any = None,
     twist_cov: Any = None,
+    child: str = "base_link",
 ) -> Message:
     return {
         "_type": "nav_msgs/msg/Odometry",
         "header": header(stamp_ns, "map"),
-        "child_frame_id": "base_link",
+        "child_frame_id": child,
         "pose": {
             "pose": {"position": xyz(position), "orientation": xyzw(quaternion)},
             "covariance": pose_cov,

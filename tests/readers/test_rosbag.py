@@ -10,7 +10,7 @@ import pytest
 
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import parse_config
-from caliv_graph.config.model import TopicsConfig
+from caliv_graph.config.model import PoseAxes, TopicsConfig
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import ConfigError, RecordingError
 from caliv_graph.products import GivenPoses
@@ -442,6 +442,42 @@ def test_gaps_of_the_imu_are_told(tmp_path: Path) -> None:
 
     (line,) = recording.warnings()
     assert line.endswith("'/imu': 1 gaps longer than 0.1 s, the longest 0.26 s")
+
+
+@pytest.mark.parametrize(
+    ("child", "mount", "axes", "said"),
+    [
+        ("camera_link", ((1.6, 0.1, 0.9), (0, 0, 0, 1)), "flu", "'camera_link' is at xyz [1.60,"),
+        ("camera_link", ((0.0, 0.0, 0.0), (0, 0, 0, 1)), "flu", ""),
+        ("base_frd", ((0.0, 0.0, 0.0), (1, 0, 0, 0)), "flu", "rpy_deg [180.0, 0.0, 0.0] in"),
+        ("base_frd", ((0.0, 0.0, 0.0), (1, 0, 0, 0)), "frd", ""),
+        ("base_footprint", ((0.0, 0.0, -0.4), (0, 0, 0, 1)), "flu", ""),
+        ("imu_link", None, "flu", ""),
+    ],
+)
+def test_poses_of_another_frame_are_named(
+    child: str, mount: Any, axes: PoseAxes, said: str, tmp_path: Path
+) -> None:
+    """As /tf_static has it; where it has nothing to say, the poses are taken for the vehicle's."""
+    links = [("base_link", "lidar", (0.0, 0.0, 2.0), (0, 0, 0, 1))]
+    links += [("base_link", child, *mount)] if mount else []
+    messages = [
+        ("/odom", stamp_of(k), odometry(stamp_of(k), (k, 0, 0), child=child)) for k in range(5)
+    ]
+    static = ("/tf_static", stamp_of(0), tf(*links))
+    path = write_bag(tmp_path / "drive", [*drive(5), *messages, static])
+    lidars = {"front": lidar(FRONT)}
+    recording = RosbagRecording(path, lidars, TopicsConfig(pose="/odom"), pose_axes=axes)
+
+    motion = recording.motion()
+
+    assert motion.poses is not None
+    assert (motion.poses.frame is not None) == (child != "base_footprint")
+    lines = [line for line in recording.warnings() if "of the frame" in line]
+    assert len(lines) == bool(said)
+    assert said in "".join(lines)
+    if child == "camera_link" and said:
+        assert "times T_camera_link_base_link from the right, xyz [-1.60, -0.10, -0.90]" in lines[0]
 
 
 def test_an_odometry_may_tell_pose_and_velocity(tmp_path: Path) -> None:

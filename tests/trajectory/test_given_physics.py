@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -13,7 +14,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.physics import raise_fatal, raw_findings
-from caliv_graph.products import Array, GivenPoses, MotionData
+from caliv_graph.products import Array, GivenPoses, MotionData, PoseFrame
 from caliv_graph.trajectory.given_physics import PosesPhysics, poses_physics
 
 NORTH_EAST = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -152,6 +153,18 @@ def test_a_vehicle_frame_that_is_meant_to_lean_does_not_stop() -> None:
     (finding,) = raw_findings({0: recorded(*other("camera"))}, Config.model_validate(CONFIG))
     assert "z of the vehicle is 87 degrees from z of the map" in finding.sentence
     assert "T_camera_vehicle, from the right" in finding.sentence
+
+
+def test_the_frame_of_a_camera_is_said_with_its_mount() -> None:
+    motion = recorded(*other("camera"))
+    assert motion.poses is not None
+    T = gtsam.Pose3(gtsam.Rot3(CAMERA), np.array([3.0, 0.0, 1.0]))
+    frame = PoseFrame("camera_optical", "base_link", T)
+    posed = replace(motion, poses=replace(motion.poses, frame=frame))
+    (finding,) = raw_findings({0: posed}, Config.model_validate(CONFIG))
+    assert "by the poses in topics.pose of the frame 'camera_optical'" in finding.sentence
+    # The vehicle's origin is 1 m below (y), and 3 m behind (-z).
+    assert "T_camera_optical_base_link is xyz [0.00, 1.00, -3.00]" in finding.sentence
 
 
 def test_positions_in_millimetres_make_a_vehicle_that_is_too_fast() -> None:

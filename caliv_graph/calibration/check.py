@@ -26,8 +26,9 @@ from caliv_graph.products import (
     Solution,
     Suspect,
 )
+from caliv_graph.readers.pose_frame import poses_source
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
-from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
+from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses, twists_at
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty import consistency
 from caliv_graph.uncertainty.consistency import (
@@ -42,7 +43,7 @@ from caliv_graph.uncertainty.consistency import (
     ScoreTest,
     Strain,
 )
-from caliv_graph.wording.contradictions import contradiction_sentence
+from caliv_graph.wording.contradictions import PosesGiven, contradiction_sentence
 from caliv_graph.wording.offsets import late_clock_sentences
 from caliv_graph.wording.suspects import doubt_sentence, ranking_sentence
 
@@ -126,7 +127,8 @@ def check(
         isinstance(t, SmoothedTrajectory) and t.data.wheels is not None for t in trajectories
     )
     sentences = [ranking_sentence(suspects, of_wheels)] if one else []
-    sentences += [contradiction_sentence(each, leads) for each in found]
+    given = _given(motions, config)
+    sentences += [contradiction_sentence(each, leads, given) for each in found]
     if sentences:
         calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))
     said = {each.drive for each in found if isinstance(each, consistency.Heading)}
@@ -141,6 +143,15 @@ def check(
     late = () if leads else tuple(late_clock_sentences(calibration.vehicle))
     concerned = tuple(name for name in calibration.lidars if any(name in _about(f) for f in found))
     return calibration, (*doubts, *late, *disagreements, *untested), concerned
+
+
+def _given(motions: Mapping[int, MotionData], config: Config) -> PosesGiven | None:
+    """The poses that were given; None: some drive has raw sensors."""
+    if not all(takes_given_poses(motion, config) for motion in motions.values()):
+        return None
+    frames = [motion.poses.frame for motion in motions.values() if motion.poses is not None]
+    alike = frames and all(each == frames[0] for each in frames[1:])
+    return PosesGiven(poses_source(config), frames[0] if alike else None)
 
 
 def _about(found: Contradiction) -> tuple[str, ...]:

@@ -21,14 +21,15 @@ from caliv_graph.conventions import AXES
 from caliv_graph.errors import RegistrationError, TargetError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack, vehicle_axes_difference
 from caliv_graph.products import Array, LidarResult, TargetObservation
+from caliv_graph.readers.pose_frame import poses_source
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.targets.cloud.choice import Choice, TriedCandidate
 from caliv_graph.targets.cloud.scans import thinned
 from caliv_graph.targets.search.place import WIDE_SIGMAS, Place, Sightings, fit_place
-from caliv_graph.trajectory.select import VehicleTrajectory, twists_at
-from caliv_graph.uncertainty.consistency import against_guesses
+from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
+from caliv_graph.uncertainty.consistency import against_guesses, together
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
-from caliv_graph.wording.contradictions import contradiction_sentence
+from caliv_graph.wording.contradictions import PosesGiven, contradiction_sentence
 
 CLOUDS = 16
 """Clouds of a LiDAR that decide: evenly spread over the views."""
@@ -164,8 +165,10 @@ def displaced_or_misguessed(
         elif of.place is not None and of.sightings is not None and of.scatter_m <= AGREE_M:
             speed_m_s = float(np.median(np.linalg.norm(of.sightings.twists[:, 3:], axis=1)))
             lidars = {n: _as_result(n, of.place, config) for n in of.place.cov if n in given}
-            found = against_guesses(lidars, speed_m_s)
-            out.update(dict.fromkeys(map(contradiction_sentence, found)))
+            found = together(tuple(against_guesses(lidars, speed_m_s)), lidars)
+            of_poses = all(isinstance(t, GivenTrajectory) for t in trajectories)
+            poses = PosesGiven(poses_source(config)) if of_poses else None
+            out.update((contradiction_sentence(each, given=poses), None) for each in found)
     return tuple(out)
 
 

@@ -154,6 +154,16 @@ def retract_vehicle_axes(T: gtsam.Pose3, d: Array) -> gtsam.Pose3:
     return gtsam.Pose3(R, T.translation() + d[3:])
 
 
+def common_motion(found: Sequence[gtsam.Pose3], guessed: Sequence[gtsam.Pose3]) -> gtsam.Pose3:
+    """T_vehicle_guessed: the frame in which poses on the vehicle were guessed, by where they are.
+
+    The mean of `T_vehicle_x T_guessed_x^-1` over all x.
+    """
+    moves = [T.compose(guess.inverse()) for T, guess in zip(found, guessed, strict=True)]
+    mean = np.mean([gtsam.Pose3.Logmap(moves[0].between(T)) for T in moves], axis=0)
+    return moves[0].compose(gtsam.Pose3.Expmap(mean))
+
+
 def stack(poses: Sequence[gtsam.Pose3]) -> tuple[Array, Array]:
     """Rotation matrices (n, 3, 3) and translations (n, 3) of poses, for batch computations."""
     R = np.array([p.rotation().matrix() for p in poses]).reshape(-1, 3, 3)

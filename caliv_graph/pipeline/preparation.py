@@ -48,6 +48,7 @@ from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import (
+    GivenTrajectory,
     VehicleTrajectory,
     noise_scales,
     smooth_trajectories,
@@ -79,6 +80,7 @@ class Prepared:
         patches: pieces of walls and other surfaces, per drive; empty: structure is not used.
         no_target: why no target was found; None: one was, or none was to be looked for.
         mistakes: of the config, that explain why LiDARs do not see the target, a sentence each.
+        misplaced: those of `contradictions` about guesses that the search had to replace.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -91,6 +93,7 @@ class Prepared:
     patches: tuple[DrivePatches, ...] = ()
     no_target: TargetError | None = None
     mistakes: tuple[str, ...] = ()
+    misplaced: tuple[str, ...] = ()
 
 
 def motions_of(
@@ -194,6 +197,7 @@ def prepare(
         patches,
         no_target,
         wrong,
+        misplaced,
     )
 
 
@@ -382,7 +386,8 @@ def targets_of(
     searched = (
         find_target(recordings, trajectories, config, progress) if config.target is None else []
     )
-    config, misplaced = realigned(config, searched)
+    given = all(isinstance(trajectory, GivenTrajectory) for trajectory in trajectories)
+    config, misplaced = realigned(config, searched, given)
     observations = extract_targets(
         recordings, trajectories, config, progress, choose_static, searched
     )

@@ -195,12 +195,15 @@ def _calibrated(
             except CalivError as error:
                 found, unread = (), f"usual mistakes of the config were not looked for: {error}"
             said = tuple(mistake_sentence(doubt, guessed) for doubt in found)
+        before = prepared.contradictions
         if said:
-            # What a solve from a mistaken guess or heading contradicts has that cause.
+            # What a solve from a mistaken guess or heading contradicts has that cause, and so has
+            # what the search takes for guesses that are off.
             calibration = replace(calibration, contradictions=())
+            before = tuple(each for each in before if each not in prepared.misplaced)
         calibration = contradicted(
             ranked_with(calibration, findings),
-            (*said, *prepared.contradictions),
+            (*said, *before),
             contradictions_of(findings),
         )
         calibration, conflicts = with_prior(calibration, prior, config)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import gtsam
@@ -26,11 +25,7 @@ from caliv_graph.readers.frames import (
     FrameTree,
     clean_frame,
     message_transforms,
-    pose_text,
 )
-
-SAME_M, SAME_RAD = 0.01, math.radians(0.5)
-"""Two frames that are nearer are one: no vehicle frame is known better."""
 
 _SIDEWAYS_M = 1.0
 """Of a vehicle that always looks along x: poses that move farther along y hold no orientation."""
@@ -40,7 +35,7 @@ class PoseCollector(RowCollector):
     """`Odometry`, `PoseStamped` or `PoseWithCovarianceStamped`: the vehicle in the map.
 
     The header's frame is taken for the map, the child frame of an odometry for the vehicle
-    (`frame_sentence`).
+    (`pose_frame.py`).
     """
 
     _WIDTH = 43
@@ -99,22 +94,6 @@ class PoseCollector(RowCollector):
         tree = FrameTree(self._static.values())
         vehicle = tree.vehicle_frame() or ""
         return PoseFrame(name, vehicle, tree.transform(vehicle, name) if vehicle else None)
-
-
-def frame_sentence(frame: PoseFrame) -> str:
-    """That poses are of a frame that `/tf_static` has elsewhere on the vehicle; or nothing."""
-    T = frame.T_vehicle_frame
-    if T is None:
-        return ""
-    turned_rad = float(np.linalg.norm(gtsam.Rot3.Logmap(T.rotation())))
-    if np.linalg.norm(T.translation()) < SAME_M and turned_rad < SAME_RAD:
-        return ""
-    return (
-        f"its poses are of the frame '{frame.name}', and are taken for those of the vehicle frame. "
-        f"By /tf_static, '{frame.name}' is at {pose_text(T)} in '{frame.vehicle}': if the initial "
-        f"guesses are in '{frame.vehicle}', give its poses, which are these times "
-        f"T_{frame.name}_{frame.vehicle} from the right, {pose_text(T.inverse())}"
-    )
 
 
 class TfCollector:

@@ -32,7 +32,7 @@ from caliv_graph.readers.pointcloud2 import (
     packets_hint,
 )
 from caliv_graph.readers.pose_file import check_overlap, in_vehicle_axes, read_poses
-from caliv_graph.readers.poses import frame_sentence
+from caliv_graph.readers.pose_frame import frame_sentence
 from caliv_graph.readers.stamps import StampMark
 from caliv_graph.readers.sweeps import (
     TimesSeen,

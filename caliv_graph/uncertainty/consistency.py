@@ -16,7 +16,11 @@ import numpy as np
 from scipy.special import bdtrc, chdtrc, ndtr
 
 from caliv_graph.conventions import AXES
-from caliv_graph.geometry.se3 import right_to_vehicle_axes, vehicle_axes_difference
+from caliv_graph.geometry.se3 import (
+    common_motion,
+    right_to_vehicle_axes,
+    vehicle_axes_difference,
+)
 from caliv_graph.mounting.mirror import are_mirror_images
 from caliv_graph.products import Array, Guess, LidarResult
 from caliv_graph.trajectory.heading import HeadingSource
@@ -435,12 +439,10 @@ def together(
     tested = _tested(lidars)
     if not found or len(tested) < 2 or any(each.swapped_with is not None for each in found):
         return tuple(found)
-    moves = [
-        lidar.T_vehicle_lidar.compose(guess.T_vehicle_lidar.inverse())
-        for lidar, guess in tested.values()
-    ]
-    mean = np.mean([gtsam.Pose3.Logmap(moves[0].between(T)) for T in moves], axis=0)
-    T_vehicle_guessed = moves[0].compose(gtsam.Pose3.Expmap(mean))
+    T_vehicle_guessed = common_motion(
+        [lidar.T_vehicle_lidar for lidar, _ in tested.values()],
+        [guess.T_vehicle_lidar for _, guess in tested.values()],
+    )
     as_given = [_most_sigmas(*of, gtsam.Pose3()) for of in tested.values()]
     moved = [_most_sigmas(*of, T_vehicle_guessed) for of in tested.values()]
     if min(as_given) < TOGETHER_SIGMAS or max(moved) > TOGETHER_SIGMAS:

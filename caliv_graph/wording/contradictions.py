@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtri
 
 from caliv_graph.conventions import AXES
+from caliv_graph.products import PoseFrame
+from caliv_graph.readers.pose_frame import different_frames, explains
 from caliv_graph.trajectory.heading import HEADING_REMEDIES, HeadingSource
 from caliv_graph.uncertainty.consistency import (
     FAR_M,
@@ -35,16 +38,32 @@ MOST_OF = 0.75
 """Fraction of the outliers that lie in one part of the drive from which that part is named."""
 
 
-def contradiction_sentence(found: Contradiction, led: bool = False) -> str:
+@dataclass(frozen=True)
+class PosesGiven:
+    """Given poses, that guesses may be in another frame than.
+
+    Attributes:
+        source: where they are from (`readers.pose_frame.poses_source`).
+        frame: that they are of; None: nothing names it, or the drives differ.
+    """
+
+    source: str
+    frame: PoseFrame | None = None
+
+
+def contradiction_sentence(
+    found: Contradiction, led: bool = False, given: PosesGiven | None = None
+) -> str:
     """A finding of `uncertainty.consistency.contradictions` for the user.
 
     `led`: a suspect is named before it. Findings without an input of their own then give no advice.
+    `given`: the poses; None: there were raw sensors.
     """
     match found:
         case GuessContradiction():
             return _guess(found)
         case GuessesTogether():
-            return _together(found)
+            return _together(found, given)
         case CloudCount():
             return (
                 f"{outliers_text(found)}; an outlier ratio of {OUTLIERS:.0%} does not explain that "
@@ -99,14 +118,15 @@ def _guess(found: GuessContradiction) -> str:
     return f"lidar '{found.lidar}': {'; '.join(parts)}. {_guess_remedy(found)}"
 
 
-def _together(found: GuessesTogether) -> str:
+def _together(found: GuessesTogether, given: PosesGiven | None) -> str:
     names = " and ".join(f"'{name}'" for name in found.lidars)
     moved = ", ".join(f"{value:+.2f}" for value in found.T_vehicle_guessed.translation() + 0.0)
     turned = ", ".join(
         f"{angle:+.1f}" for angle in np.degrees(found.T_vehicle_guessed.rotation().rpy()) + 0.0
     )
     late = ""
-    if found.late_s is not None:
+    source, frame = ("", None) if given is None else (given.source, given.frame)
+    if found.late_s is not None and not explains(frame, found.T_vehicle_guessed):
         way = "late" if found.late_s > 0.0 else "early"
         late = (
             f". Stamps of all LiDARs that are {abs(found.late_s):.2f} s {way} at "
@@ -115,9 +135,8 @@ def _together(found: GuessesTogether) -> str:
     return (
         f"lidars {names}: the initial guesses of all are off by the same ({found.sigmas:.0f} "
         f"sigma): they fit if their vehicle frame is moved by ({moved}) m and turned by ({turned}) "
-        "degrees (roll, pitch, yaw). Guesses and motion data are of different vehicle frames: "
-        "check origin and axes of the guesses, and of topics.pose or the mounts of IMU, antenna "
-        f"and wheels{late}"
+        "degrees (roll, pitch, yaw). "
+        f"{different_frames(found.T_vehicle_guessed, source, frame)}{late}"
     )
 
 

@@ -13,6 +13,7 @@ from caliv_graph.mounting.doubts import Doubt, turned_over
 from caliv_graph.mounting.mirror import are_mirror_images
 from caliv_graph.mounting.place import Placement
 from caliv_graph.mounting.sharpness import CELLS_M
+from caliv_graph.readers.pose_frame import pose_key
 
 WITH_Y_LEFT = "change the sign of y, pitch and yaw of all guesses"
 """Of guesses on a vehicle with x forward, y right, z down."""
@@ -153,11 +154,6 @@ def _heading_remedy(found: Doubt, config: Config) -> str:
     if abs(found.turn_deg) == 180:
         reversed_too = ": a vehicle that reverses points against its course"
     return f"Check {key}, and that all initial guesses are in the vehicle frame{reversed_too}"
-
-
-def pose_key(config: Config) -> str:
-    """Where the config names the given poses."""
-    return "data.poses" if config.data.poses is not None else "topics.pose"
 
 
 def _pose(T_vehicle_lidar: gtsam.Pose3) -> str:

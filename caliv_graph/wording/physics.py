@@ -13,6 +13,7 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, Finding
 from caliv_graph.readers.frames import pose_text
+from caliv_graph.readers.pose_frame import poses_source
 from caliv_graph.targets.cloud.copies import Copy
 from caliv_graph.targets.ground.guesses import Misfit
 from caliv_graph.trajectory.alignment import level
@@ -34,7 +35,6 @@ from caliv_graph.trajectory.physics import (
 )
 from caliv_graph.trajectory.tilt import VehicleTilt, body_sigma_rad
 from caliv_graph.uncertainty.consistency import CONTRADICTION_P, CONTRADICTION_SIGMAS
-from caliv_graph.wording.mounting import pose_key
 
 WARNING_SIGMAS = 3.0
 """From here a disagreement is said."""
@@ -365,7 +365,7 @@ _READINGS = {
 
 def fast_finding(name: str, speed_m_s: float, config: Config) -> Finding:
     """Given poses that are as fast as no vehicle is: positions are in another unit."""
-    where = "input/ego_poses.yaml" if config.data.format == "caliv" else pose_key(config)
+    where = poses_source(config)
     sigma = MAX_SPEED_M_S / CONTRADICTION_SIGMAS
     return Finding(
         "topics.pose",
@@ -409,7 +409,7 @@ def poses_finding(found: PosesPhysics, config: Config) -> Finding:
         )
         mended.append(f"{math.degrees(then.aside_rad):.1f} degrees")
     ways, remedies = zip(*(_READINGS[reading] for reading in found.readings), strict=True)
-    where = "input/ego_poses.yaml" if config.data.format == "caliv" else pose_key(config)
+    where = poses_source(config)
     if config.data.format == "caliv" and "frd" in found.readings:
         remedies = ("Convert them to a vehicle with x forward, y left, z up, in a map with z up",)
     off, limit = max(limits, key=lambda of: of[0] / of[1])

@@ -17,7 +17,7 @@ from caliv_graph.geometry.se3 import (
     right_to_vehicle_axes,
     vehicle_axes_difference,
 )
-from caliv_graph.products import Array, Guess, LidarResult
+from caliv_graph.products import Array, Guess, LidarResult, PoseFrame
 from caliv_graph.uncertainty.consistency import (
     CONTRADICTION_P,
     OUTLIERS,
@@ -42,7 +42,7 @@ from caliv_graph.uncertainty.consistency import (
     p_value,
     too_many_outliers,
 )
-from caliv_graph.wording.contradictions import contradiction_sentence
+from caliv_graph.wording.contradictions import PosesGiven, contradiction_sentence
 from tests.samples import MOUNTINGS, pose
 
 GUESS_SIGMAS = np.array([0.03] * 3 + [0.058] * 3)
@@ -193,6 +193,13 @@ def test_guesses_of_another_vehicle_frame_are_off_together() -> None:
     assert np.abs(off).max() < 0.03
     assert "moved by (-0.8" in contradiction_sentence(found)
     assert "turned by (+0.0, +0.0, +12.0) degrees" in contradiction_sentence(found)
+    assert "mounts of IMU, antenna and wheels" in contradiction_sentence(found)
+    posed = PosesGiven("topics.pose", PoseFrame("gps", "base_link", T.inverse()))
+    assert "whose poses are of the frame 'gps'" in contradiction_sentence(found, given=posed)
+    # What /tf_static explains needs no clock.
+    late = replace(found, late_s=0.4, speed_m_s=2.0)
+    assert "Stamps of all LiDARs that are 0.40 s late" in contradiction_sentence(late)
+    assert "Stamps" not in contradiction_sentence(late, given=posed)
     # One that is right as it is: then the others are off for themselves.
     lidars["front"] = result(pose(*MOUNTINGS["front"]), np.zeros(6))
     alone = contradictions(CheckInputs(lidars=lidars))

@@ -128,7 +128,7 @@ def check(
     )
     sentences = [ranking_sentence(suspects, of_wheels)] if one else []
     given = _given(motions, config)
-    sentences += [contradiction_sentence(each, leads, given) for each in found]
+    sentences += [contradiction_sentence(each, one, given) for each in found]
     if sentences:
         calibration = replace(calibration, status="inconsistent", contradictions=tuple(sentences))
     said = {each.drive for each in found if isinstance(each, consistency.Heading)}

@@ -324,31 +324,24 @@ def _on_rough_ground(
     if not ground.use:
         return config, ()
     guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
-    most_m, lines = 0.0, []
+    rough = {}
     for of in patches:
         rough_m = ground_roughness_m(of, trajectories[of.drive], guesses)
         if rough_m is not None and rough_m > ROUGH_M:
-            most_m = max(most_m, rough_m)
-            name = recordings[of.drive].name
-            stated_m = None if ground.vehicle_height is None else ground.sigma
-            lines.append(
-                rough_ground_sentence(
-                    name,
-                    rough_m,
-                    stated_m,
-                    math.hypot(ground.sigma, LIFT * rough_m),
-                    math.radians(noise.lidar_ground_tilt_deg or 0.0) or TILT_PER_M * rough_m,
-                )
-            )
-    if not lines:
+            rough[recordings[of.drive].name] = rough_m
+    if not rough:
         return config, ()
-    tilt_deg = noise.lidar_ground_tilt_deg or math.degrees(TILT_PER_M * most_m)
-    known = ground
+    most_m = max(rough.values())
+    stated_m, used_m = None, ground.sigma
     if ground.vehicle_height is not None:
-        sigma_m = math.hypot(ground.sigma, LIFT * most_m)
-        known = ground.model_copy(update={"sigma": sigma_m})
-    noise = noise.model_copy(update={"lidar_ground_tilt_deg": tilt_deg})
-    return config.model_copy(update={"ground": known, "noise": noise}), tuple(lines)
+        stated_m, used_m = ground.sigma, math.hypot(ground.sigma, LIFT * most_m)
+    tilt_deg = noise.lidar_ground_tilt_deg or math.degrees(TILT_PER_M * most_m)
+    known = {
+        "ground": ground.model_copy(update={"sigma": used_m}),
+        "noise": noise.model_copy(update={"lidar_ground_tilt_deg": tilt_deg}),
+    }
+    said = rough_ground_sentence(rough, stated_m, used_m, math.radians(tilt_deg))
+    return config.model_copy(update=known), (said,)
 
 
 def _with_cause(

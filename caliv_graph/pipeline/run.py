@@ -280,11 +280,13 @@ def without_anything(prepared: Prepared, error: TargetError) -> TargetError:
         for name, lidar in prepared.config.lidars.items()
         if lidar.min_range > NEAR_M or lidar.max_range < FAR_M
     }
+    error = with_standing(error, prepared.trajectories) or error
     if narrow:
-        error = TargetError(error.what, ranges_sentence(narrow))
+        # In a hall with 8 m to the walls a short max_range is right.
+        said = ranges_sentence(narrow)
+        error = TargetError(error.what, f"{error.remedy}. {said}" if error.remedy else said)
     if prepared.no_target is None:
-        stood = None if narrow else with_standing(error, prepared.trajectories)
-        return stood or error
+        return error
     said = str(error) if narrow else error.what
     return TargetError(nothing_sentence(str(prepared.no_target), said))
 

@@ -34,7 +34,7 @@ class _Extent:
 def with_standing(
     error: TargetError, trajectories: Sequence[VehicleTrajectory]
 ) -> TargetError | None:
-    """The error of drives in which the vehicle stood, whose remedy is to drive; None: it moved."""
+    """The error of drives in which the vehicle stood, with the remedy to drive; None: it moved."""
     extents = [extent for t in trajectories if (extent := _extent(t)) is not None]
     moved = [e for e in extents if e.moved_m > STILL_M or e.turned_rad > STILL_RAD]
     if not extents or moved or len(extents) < len(trajectories):
@@ -42,7 +42,9 @@ def with_standing(
     most = max(extents, key=lambda extent: extent.moved_m)
     turned_deg = float(np.degrees(max(extent.turned_rad for extent in extents)))
     longest_s = max(extent.lasts_s for extent in extents)
-    return TargetError(error.what, standing_sentence(most.moved_m, turned_deg, longest_s))
+    stands = standing_sentence(most.moved_m, turned_deg, longest_s)
+    # A target may have been carried to several places, and its region be wrong.
+    return TargetError(error.what, f"{stands}. {error.remedy}" if error.remedy else stands)
 
 
 def _extent(trajectory: VehicleTrajectory) -> _Extent | None:

@@ -165,7 +165,8 @@ def _part_warnings(name: str, clocks: Mapping[str, Clock]) -> list[str]:
     """Topics that cover a part of the drive, by the time of their recording."""
     spans = {}
     for topic, clock in clocks.items():
-        if clock.messages:
+        # One message has no end, and stamps of two epochs have no common start.
+        if clock.period_s is not None and not clock.unset:
             ahead_ns = round(
                 (clock.offset_s[1] if clock.offset_s else 0.0) * NANOSECONDS_PER_SECOND
             )

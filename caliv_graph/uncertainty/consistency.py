@@ -13,7 +13,7 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from scipy.special import bdtrc, chdtrc, ndtr
+from scipy.special import bdtrc, chdtrc, chdtri, ndtr
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import (
@@ -30,7 +30,14 @@ CONTRADICTION_SIGMAS = 5.0
 """Of a normal variable: the limit of every test."""
 
 TOGETHER_SIGMAS = 3.0
-"""Of differences from guesses: what is beyond is no chance, what is below may be."""
+"""Of a guess that is off: what is beyond is no chance, what is below may be."""
+
+TOGETHER_P = 0.1
+"""Chance by which guesses of one wrong frame are told as ones that are off each for itself. Two,
+one 3.3 sigmas off in x and one in y, would pass for one motion at 0.09."""
+
+TOGETHER_LEFT = 0.25
+"""Part of the squares of the differences that a common motion may leave at most."""
 
 IN_FRAME = np.array([math.radians(0.5)] * 3 + [0.03] * 3)
 """Difference from a frame up to which a LiDAR is at it, rad and m: what a drive leaves open. No
@@ -293,6 +300,7 @@ class GuessesTogether:
         sigmas: of the largest difference of an estimate from its guess.
         late_s: as of `GuessContradiction`, the median of those that are contradicted.
         speed_m_s: of the vehicle.
+        has_z: whether the data determine the z of all of them.
     """
 
     lidars: tuple[str, ...]
@@ -300,6 +308,7 @@ class GuessesTogether:
     sigmas: float
     late_s: float | None
     speed_m_s: float
+    has_z: bool = True
 
 
 @dataclass(frozen=True)
@@ -419,12 +428,15 @@ def _already_in(name: str, lidars: Mapping[str, LidarResult]) -> Frame | None:
     """The frame in which the clouds of a LiDAR are, by where it was found."""
     others = [(Frame(other), of.T_vehicle_lidar) for other, of in lidars.items() if other != name]
     lidar = lidars[name]
-    told = np.array([lidar.determined[axis] for axis in AXES])
-    if not told[:3].all() or not told[3:].any():
+    told = {n: np.array([of.determined[axis] for axis in AXES]) for n, of in lidars.items()}
+    # In plan, too: of two on one mast z may be all that differs.
+    if not told[name][:5].all():
         return None
     for frame, T in ((Frame(None), gtsam.Pose3()), *others):
+        if frame.lidar is not None and not (told[name].all() and told[frame.lidar].all()):
+            continue
         off = np.abs(vehicle_axes_difference(lidar.T_vehicle_lidar, T))
-        if (off < IN_FRAME)[told].all():
+        if (off < IN_FRAME)[told[name]].all():
             return frame
     return None
 
@@ -434,32 +446,53 @@ def together(
 ) -> tuple[GuessContradiction | GuessesTogether, ...]:
     """The findings; one in their place if a motion of the vehicle frame explains all guesses.
 
-    Not where one LiDAR is at the guess of another, nor where some guess is right as it is.
+    Not where one LiDAR is at the guess of another, where some guess is right as it is, where a
+    trusted extrinsic tells that the frame is right, or where x, y or a rotation is undetermined.
     """
     tested = _tested(lidars)
-    if not found or len(tested) < 2 or any(each.swapped_with is not None for each in found):
+    told = {
+        name: np.array([of.determined[axis] for axis in AXES]) for name, (of, _) in tested.items()
+    }
+    trusted = any(of.guess is not None and of.guess.fixed and of.has_data for of in lidars.values())
+    swapped = any(each.swapped_with is not None for each in found)
+    if not found or len(tested) < 2 or swapped or trusted:
+        return tuple(found)
+    if not all(axes[:5].all() for axes in told.values()):
         return tuple(found)
     T_vehicle_guessed = common_motion(
         [lidar.T_vehicle_lidar for lidar, _ in tested.values()],
         [guess.T_vehicle_lidar for _, guess in tested.values()],
     )
-    as_given = [_most_sigmas(*of, gtsam.Pose3()) for of in tested.values()]
-    moved = [_most_sigmas(*of, T_vehicle_guessed) for of in tested.values()]
-    if min(as_given) < TOGETHER_SIGMAS or max(moved) > TOGETHER_SIGMAS:
+    as_given, moved = (
+        [_off_sigmas(*tested[name], T)[told[name]] for name in tested]
+        for T in (gtsam.Pose3(), T_vehicle_guessed)
+    )
+    if min(float(off.max()) for off in as_given) < TOGETHER_SIGMAS:
+        return tuple(found)
+    squares, left = (sum(float(off @ off) for off in offs) for offs in (as_given, moved))
+    free = sum(len(off) for off in moved) - max(len(off) for off in moved)
+    if left > min(float(chdtri(free, TOGETHER_P)), TOGETHER_LEFT * squares):
         return tuple(found)
     late = [each.late_s for each in found if each.late_s is not None]
     late_s = float(np.median(late)) if len(late) == len(found) else None
     speed_m_s = found[0].speed_m_s
-    return (GuessesTogether(tuple(tested), T_vehicle_guessed, max(as_given), late_s, speed_m_s),)
-
-
-def _most_sigmas(lidar: LidarResult, guess: Guess, T_vehicle_guessed: gtsam.Pose3) -> float:
-    """Of the determined axes, the largest difference of an estimate from a guess that is moved."""
-    moved = T_vehicle_guessed.compose(guess.T_vehicle_lidar)
-    off = np.abs(vehicle_axes_difference(lidar.T_vehicle_lidar, moved)) / _sigmas(lidar, guess)
-    return max(
-        (float(off[i]) for i, axis in enumerate(AXES) if lidar.determined[axis]), default=0.0
+    return (
+        GuessesTogether(
+            lidars=tuple(tested),
+            T_vehicle_guessed=T_vehicle_guessed,
+            sigmas=max(float(off.max()) for off in as_given),
+            late_s=late_s,
+            speed_m_s=speed_m_s,
+            has_z=all(bool(axes[5]) for axes in told.values()),
+        ),
     )
+
+
+def _off_sigmas(lidar: LidarResult, guess: Guess, T_vehicle_guessed: gtsam.Pose3) -> Array:
+    """(6,) differences of an estimate from a guess that is moved, in sigmas."""
+    moved = T_vehicle_guessed.compose(guess.T_vehicle_lidar)
+    off = np.abs(vehicle_axes_difference(lidar.T_vehicle_lidar, moved))
+    return np.asarray(off / _sigmas(lidar, guess))
 
 
 def _swapped_with(name: str, lidars: Mapping[str, LidarResult]) -> str | None:

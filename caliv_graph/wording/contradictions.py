@@ -120,7 +120,8 @@ def _guess(found: GuessContradiction) -> str:
 
 def _together(found: GuessesTogether, given: PosesGiven | None) -> str:
     names = " and ".join(f"'{name}'" for name in found.lidars)
-    moved = ", ".join(f"{value:+.2f}" for value in found.T_vehicle_guessed.translation() + 0.0)
+    x, y, z = (f"{value:+.2f}" for value in found.T_vehicle_guessed.translation() + 0.0)
+    moved = f"{x}, {y}, {z if found.has_z else '-'}"
     turned = ", ".join(
         f"{angle:+.1f}" for angle in np.degrees(found.T_vehicle_guessed.rotation().rpy()) + 0.0
     )
@@ -150,10 +151,15 @@ def _guess_remedy(found: GuessContradiction) -> str:
         )
     if found.frame is not None:
         of = found.frame.lidar
+        if of is None:
+            return (
+                f"The estimate is the vehicle frame. Either the clouds of '{found.lidar}' are in "
+                "that frame already, moved by a driver or a node: give its clouds as it measures "
+                f"them. Or the poses are those of '{found.lidar}': then give guesses from it"
+            )
         return (
-            f"The estimate is {'the vehicle frame' if of is None else f'that of {of!r}'}: the "
-            f"clouds of '{found.lidar}' are in that frame already, moved by a driver or a node. "
-            "Give its clouds as it measures them"
+            f"The estimate is that of '{of}': the clouds of '{found.lidar}' are in that frame "
+            "already, moved by a driver or a node. Give its clouds as it measures them"
         )
     if found.late_s is not None:
         way = "late" if found.late_s > 0.0 else "early"

@@ -15,8 +15,10 @@ from caliv_graph.mounting.place import Placement
 from caliv_graph.mounting.sharpness import CELLS_M
 from caliv_graph.readers.pose_frame import pose_key
 
-WITH_Y_LEFT = "change the sign of y, pitch and yaw of all guesses"
-"""Of guesses on a vehicle with x forward, y right, z down."""
+WITH_Y_LEFT = (
+    "change the sign of y and yaw of all guesses, and of roll or pitch if they are counted so"
+)
+"""Of guesses with y to the right: with z up roll changes its sign, with z down pitch does."""
 
 MOST_OTHERS = 2
 """Other mountings that are listed."""

@@ -42,13 +42,15 @@ def standing_sentence(moved_m: float, turned_deg: float, lasts_s: float) -> str:
 
 
 def rough_ground_sentence(
-    drive: str, roughness_m: float, stated_m: float | None, used_m: float, tilt_rad: float
+    roughness_m: Mapping[str, float], stated_m: float | None, used_m: float, tilt_rad: float
 ) -> str:
     """The warning that the ground seen may not be what carries the wheels.
 
-    `stated_m` is 1 sigma of the height as stated, None if no height is; `used_m` in its place;
-    `tilt_rad` of each LiDAR's ground.
+    `roughness_m` is that of each drive with such ground, by its name; `stated_m` 1 sigma of the
+    height as stated, None if no height is; `used_m` in its place; `tilt_rad` that of the tilt.
     """
+    drives = ", ".join(roughness_m)
+    scatter = " and ".join(f"{1e3 * of:.0f}" for of in roughness_m.values())
     height, better = "", "roll and pitch"
     if stated_m is not None:
         height = (
@@ -57,7 +59,7 @@ def rough_ground_sentence(
         )
         better = "roll, pitch and z"
     return (
-        f"{drive}: the ground scatters by {1e3 * roughness_m:.0f} mm from point to point, as grass "
+        f"{drives}: the ground scatters by {scatter} mm from point to point, as grass "
         f"or gravel does: LiDARs see its tips, wheels sink in. {height}each LiDAR's ground is "
         f"believed to {1e3 * tilt_rad:.2f} mrad of tilt, in all drives. For {better} use drives on "
         "asphalt or concrete alone"

@@ -95,7 +95,7 @@ def test_swapped_topics_of_a_symmetric_rig_may_be_guesses_with_y_to_the_right() 
         Doubt(0, "drive", "exchanged", ("left", "right"), 0, sharing, False), config
     )
     assert "the topics of lidars 'left' and 'right' are swapped, or y of both guesses" in text
-    assert "change the sign of y, pitch and yaw of all guesses" in text
+    assert "change the sign of y and yaw of all guesses, and of roll or pitch if" in text
 
 
 @pytest.mark.parametrize("degrees", [180.0, -90.0])

@@ -169,6 +169,9 @@ def test_clouds_that_are_in_another_frame_already_are_named() -> None:
     )
     lidars["front"] = replace(lidars["front"], guess=None)  # at its guess, topics were swapped
     (found,) = against_guesses(lidars)
+    assert found.frame is None  # one above the other on a mast
+    lidars["rear"] = replace(lidars["rear"], determined=ALL)
+    (found,) = against_guesses(lidars)
     assert "The estimate is that of 'front': the clouds of 'rear'" in contradiction_sentence(found)
     lidars["rear"] = replace(
         lidars["rear"], T_vehicle_lidar=retract_vehicle_axes(front, along("x", 0.3))
@@ -216,6 +219,36 @@ def test_guesses_that_are_off_by_something_of_their_own_are_not_off_together() -
     }
     found = contradictions(CheckInputs(lidars=lidars))
     assert [type(each) for each in found] == [GuessContradiction] * 2
+
+
+def test_a_motion_that_explains_a_part_of_two_guesses_does_not_make_them_off_together() -> None:
+    """One is off in x and one in y: by the half of both, each would be 1.7 sigma off."""
+    sigma = float(GUESS_SIGMAS[3])
+    lidars = {
+        name: result(pose(*MOUNTINGS[name]), along(axis, 5.5 * sigma))
+        for name, axis in (("front", "x"), ("rear", "y"))
+    }
+    found = contradictions(CheckInputs(lidars=lidars))
+    assert [type(each) for each in found] == [GuessContradiction] * 2
+
+
+@pytest.mark.parametrize("doubt", ["trusted", "x", "yaw"])
+def test_what_does_not_tell_the_frame_of_the_guesses_blames_each(doubt: str) -> None:
+    """A third LiDAR that is trusted and fits; axes that the drive does not determine."""
+    off = along("x", 1.0)
+    lidars = {name: result(pose(*MOUNTINGS[name]), off) for name in ("front", "rear")}
+    (found,) = contradictions(CheckInputs(lidars=lidars))
+    assert isinstance(found, GuessesTogether)
+    if doubt == "trusted":
+        left = result(pose(*MOUNTINGS["left"]), np.zeros(6))
+        assert left.guess is not None
+        lidars["left"] = replace(left, guess=replace(left.guess, fixed=True))
+    else:
+        front = lidars["front"]
+        lidars["front"] = replace(front, determined={**front.determined, doubt: False})
+    found_now = contradictions(CheckInputs(lidars=lidars))
+    assert found_now
+    assert all(isinstance(each, GuessContradiction) for each in found_now)
 
 
 # ------------------------------------------------------------------ clouds

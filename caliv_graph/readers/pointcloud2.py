@@ -80,6 +80,12 @@ TIME_FIELDS = (
 )
 """Names of per-point times: of Ouster, Velodyne, Hesai and Robosense, Autoware, Livox, others."""
 
+_PARTS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+"""Units of times after the stamp that are taken for seconds, the largest first."""
+
+_LEAST_SWEEP_S = 0.01
+"""A sweep takes more: no LiDAR turns 100 times a second."""
+
 _MOST_S = 1.0
 """Seconds between a cloud's stamp and its points, at most: a sweep takes less. Other times follow a
 convention that is not known."""
@@ -278,7 +284,7 @@ def _with_times(
             if np.isfinite(times_s).all() and np.abs(times_s).max() <= _MOST_S:
                 found = TimeField(field.name, field.type, unit)
                 return DecodedCloud(points_lidar, times_s, found)
-        problem = problem or _problem(field, readings)
+        problem = problem or _problem(field, values, readings)
     return DecodedCloud(points_lidar, None, time_problem=problem)
 
 
@@ -322,7 +328,9 @@ def _whole_readings(
         yield after
 
 
-def _problem(field: TimeField, readings: Sequence[tuple[str, Array]]) -> str:
+def _problem(
+    field: TimeField, values: npt.NDArray[Any], readings: Sequence[tuple[str, Array]]
+) -> str:
     """Why none of the readings is plausible, in the words of the most common."""
     where = f"field '{field.name}' ({field.type})"
     if not readings:
@@ -334,5 +342,23 @@ def _problem(field: TimeField, readings: Sequence[tuple[str, Array]]) -> str:
     first, last = float(finite.min()), float(finite.max())
     return (
         f"{where}, read as {unit}, spans {first:.4g} to {last:.4g} s from the stamp, more than "
-        f"{_MOST_S:g} s"
+        f"{_MOST_S:g} s{_other_unit(field, values)}"
     )
+
+
+def _other_unit(field: TimeField, values: npt.NDArray[Any]) -> str:
+    """The unit in which times that count from the stamp, of a field of seconds, would be a sweep's.
+
+    Of a clock of its own, the times of a cloud differ by little of what they are.
+    """
+    if field.type not in ("float32", "float64"):
+        return ""
+    values = values.astype(np.float64)
+    for unit, scale in _PARTS.items():
+        first_s, last_s = float(values.min()) * scale, float(values.max()) * scale
+        if max(abs(first_s), abs(last_s)) <= _MOST_S and last_s - first_s >= _LEAST_SWEEP_S:
+            return (
+                f". In {unit} it would span {first_s:.4g} to {last_s:.4g} s: convert the field to "
+                "seconds, and give that recording"
+            )
+    return ""

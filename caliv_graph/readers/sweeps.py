@@ -239,7 +239,7 @@ def times_warnings(
 def untimed_warning(where: str, seen: Mapping[str, TimesSeen]) -> list[str]:
     """A line if some LiDARs of a recording, of those that were read, have times and others not."""
     timed = [f"'{name}'" for name, times in seen.items() if times.field and times.span_s > 0.0]
-    without = [f"'{name}'" for name, times in seen.items() if times == TimesSeen()]
+    without = [f"'{name}'" for name, times in seen.items() if times.field is None]
     if not timed or not without:
         return []
     return [

@@ -148,6 +148,14 @@ def test_an_absolute_time_in_a_simulation_that_began_a_moment_ago() -> None:
         ("time", "f4", SWEEP * 1e6, "field 'time' (float32), read as s after the stamp, spans 0"),
         ("t", "u4", [0, 1, 2, 1_200_000_000], "to 1.2 s from the stamp, more than 1 s"),
         ("timestamp", "f8", STAMP / 1e9 + 37.0 + SWEEP, "spans 37 to 37.1 s"),
+        ("time", "f4", SWEEP * 1e3, "In milliseconds it would span 0 to 0.099 s: convert"),
+        (
+            "t",
+            "f4",
+            SWEEP * 1e6,
+            "In microseconds it would span 0 to 0.099 s: convert the field to",
+        ),
+        ("timestamp", "f8", SWEEP * 1e9, "In nanoseconds it would span 0 to 0.099 s: convert"),
         ("t", "u1", [0, 1, 2, 3], "is of a type that no known convention has"),
         ("time", "f4", [0.0, math.nan, 0.0, 0.1], "holds values that are not finite"),
     ],
@@ -161,6 +169,13 @@ def test_times_that_are_not_believed_are_told(
     assert found.time_field is None
     assert words in found.time_problem
     assert len(found.points_lidar) == 4
+
+
+def test_times_of_another_clock_are_not_in_another_unit() -> None:
+    found = decode(cloud(STAMP, POINTS, 123456.0 + SWEEP, ("timestamp", "f8")))
+
+    assert "from the stamp, more than 1 s" in found.time_problem
+    assert "convert" not in found.time_problem
 
 
 def test_the_first_plausible_field_counts() -> None:

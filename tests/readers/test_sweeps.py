@@ -166,6 +166,10 @@ def test_a_lidar_without_times_beside_one_that_has_them_is_named() -> None:
     flash, none = TimesSeen(timed.field, clouds=20), TimesSeen()
     (line,) = untimed_warning("bag", {"top": timed, "left": none, "right": none})
     assert line.startswith("bag: points of 'left' and 'right' have no times, those of 'top' have.")
+    # Nor those that are not used, as of another unit.
+    unused = TimesSeen(problems=20, problem="in another unit")
+    (line,) = untimed_warning("bag", {"top": timed, "left": unused})
+    assert line.startswith("bag: points of 'left' have no times, those of 'top' have.")
     for of in (
         {"top": timed, "left": flash},
         {"top": none, "left": none},

@@ -81,6 +81,9 @@ def motion_findings(found: MotionPhysics, config: Config) -> tuple[Finding, ...]
     if found.gravity is None:
         return (*_rates(found), *heading)
     if found.gravity.tilt_rad > MAX_GRAVITY_TILT_RAD:
+        reversed_force = _reversed_force(found, found.gravity)
+        if reversed_force is not None:
+            return (reversed_force,)  # the gyroscope about this up is reversed by it
         # Nothing else can be judged about wrong axes, but units can.
         return (_gravity(found, config), *_rates(found))
     mirrored = _mirrored_fixes(found)
@@ -91,6 +94,38 @@ def motion_findings(found: MotionPhysics, config: Config) -> tuple[Finding, ...]
         told = found.oriented or config.topics.heading is not None
         out += _axes(found.name, axes, config, told)
     return tuple(out)
+
+
+def _reversed_force(found: MotionPhysics, gravity: Gravity) -> Finding | None:
+    """A specific force of the opposite sign: gravity is down, about which the gyroscope turns back.
+
+    An IMU that hangs upside down turns as fast as the course about what it has for up.
+    """
+    ratios = [r for r in found.gyroscope if r.against == "course"] or list(found.gyroscope)
+    if math.pi - gravity.tilt_rad > MAX_GRAVITY_TILT_RAD or not ratios:
+        return None
+    ratio = ratios[0]
+    if abs(ratio.value + 1.0) > max(KNOWN_PART, WARNING_SIGMAS * ratio.sigma):
+        return None
+    sigmas = (1.0 - ratio.value) / ratio.sigma
+    if sigmas < CONTRADICTION_SIGMAS:
+        return None
+    turns = f"{-ratio.value:.3g} +- {ratio.sigma:.1g} times as fast as the"
+    return Finding(
+        "topics.imu",
+        (),
+        ratio.sigma,
+        sigmas,
+        "fatal",
+        f"{found.name}: the specific force of the IMU points down, "
+        f"{math.degrees(gravity.tilt_rad):.0f} degrees from the vehicle's +z, and the gyroscope "
+        f"turns {turns} {_SOURCES[ratio.against]} about +z: the sign of the acceleration is "
+        "reversed. At rest the axis that is up must read +9.8 m/s^2: multiply linear_acceleration "
+        "by -1",
+    )
+
+
+_SOURCES = {"course": "course over ground", "orientation": "orientation of the same messages"}
 
 
 def _mirrored_fixes(found: MotionPhysics) -> Finding | None:
@@ -113,15 +148,21 @@ def _mirrored_fixes(found: MotionPhysics) -> Finding | None:
     )
 
 
-def gravity_problem(up_imu: Array, R_vehicle_imu: Array) -> str:
-    """What is wrong with an IMU whose gravity is not along the vehicle's +z; empty: nothing."""
+def gravity_problem(up_imu: Array, R_vehicle_imu: Array, hangs: bool = False) -> str:
+    """What is wrong with an IMU whose gravity is not along the vehicle's +z; empty: nothing.
+
+    `hangs`: the gyroscope agrees with this direction of gravity.
+    """
     gravity = Gravity(up_imu, R_vehicle_imu @ up_imu)
     if gravity.tilt_rad <= MAX_GRAVITY_TILT_RAD:
         return ""
     roll, pitch = (f"{round(v) + 0.0:.0f}" for v in gravity.roll_pitch_deg)
+    down = math.pi - gravity.tilt_rad < MAX_GRAVITY_TILT_RAD and not hangs
+    unless = ", unless the sign of the acceleration is reversed" if down else ""
     return (
         f"gravity is {_gravity_axis(up_imu)}, {math.degrees(gravity.tilt_rad):.0f} degrees from "
-        f"the vehicle's +z: imu.T_vehicle_imu rpy_deg about ({roll}, {pitch}, yaw) would fit"
+        f"the vehicle's +z: imu.T_vehicle_imu rpy_deg about ({roll}, {pitch}, yaw) would "
+        f"fit{unless}"
     )
 
 
@@ -144,7 +185,8 @@ def _gravity(found: MotionPhysics, config: Config) -> Finding:
     assert gravity is not None
     given = config.imu.T_vehicle_imu
     value: tuple[float, ...] = ()
-    sentence = gravity_problem(gravity.up_imu, given.pose().rotation().matrix())
+    hangs = any(abs(ratio.value - 1.0) <= GROSS_RATIO for ratio in found.gyroscope)
+    sentence = gravity_problem(gravity.up_imu, given.pose().rotation().matrix(), hangs)
     axes = found.axes
     if axes is not None and not axes.mirrored and axes.sigma_rad < MIN_YAW_RAD:
         R = given.pose().rotation().matrix()

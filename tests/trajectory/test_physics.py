@@ -127,6 +127,25 @@ def test_a_wrong_imu_is_named(
         assert said in found.sentence
 
 
+@pytest.mark.parametrize("course", [EIGHT, ARC], ids=["eight", "arc"])
+def test_a_force_of_the_opposite_sign_is_no_imu_that_hangs(course: Course) -> None:
+    """Gravity is down in both; about it a gyroscope that hangs turns as the course does."""
+    without = {"orientation_xyzw": lambda q: np.full_like(q, np.nan)}
+    over = np.diag([1.0, -1.0, -1.0])
+    for seed in SEEDS:
+        motion = recorded(course, seed)
+        (found,) = found_in(imu(motion, specific_force=np.negative, **without))
+        assert (found.input, found.severity) == ("topics.imu", "fatal")
+        assert "the sign of the acceleration is reversed" in found.sentence
+        assert "multiply linear_acceleration by -1" in found.sentence
+        assert "would fit" not in found.sentence
+        turned = {name: lambda v: v @ over for name in ("specific_force", "angular_velocity")}
+        (hangs,) = found_in(imu(motion, **turned, **without))
+        assert hangs.input == "imu.T_vehicle_imu"
+        assert "0, yaw) would fit" in hangs.sentence
+        assert "sign" not in hangs.sentence
+
+
 def test_swapped_latitude_and_longitude_are_named() -> None:
     """A mirrored path: nothing else that it contradicts is said."""
     for seed in SEEDS:

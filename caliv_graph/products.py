@@ -483,6 +483,8 @@ class StructureTerm:
         offset_m: 1 sigma of the offset of a strip in a scan, estimated.
         ground: LiDARs whose ground is in it, and the vehicle's stand on it if that is known.
         warnings: for the user, a line each.
+        on_ground: false: the level strips below the vehicle are far above the ground by
+            `vehicle_height`, which then tells no height.
         odometry_of: the LiDAR by whose odometry the poses are known, and of whose mounting ground
             and direction of travel alone tell the rotation; empty: there are motion data.
         stance: how the vehicle stands on the ground; None: no ground below it was seen.
@@ -507,6 +509,7 @@ class StructureTerm:
     offset_m: float
     ground: frozenset[str] = frozenset()
     warnings: tuple[str, ...] = ()
+    on_ground: bool = True
     odometry_of: str = ""
     stance: Stance | None = None
     standing: StandingErrors | None = None

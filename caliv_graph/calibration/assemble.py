@@ -71,8 +71,11 @@ def assemble(
         evidence_of_terms(solution.structure, bool(solution.registrations)),
     )
     if config.ground.use and config.ground.vehicle_height is not None:
+        stands = height_is_used(solution.structure, bool(solution.registrations))
         undetermined, weak = (
-            tuple(with_height_set(direction, config.ground.sigma) for direction in directions)
+            tuple(
+                with_height_set(direction, config.ground.sigma, stands) for direction in directions
+            )
             for directions in (uncertainty.undetermined, uncertainty.weak)
         )
         uncertainty = replace(uncertainty, undetermined=undetermined, weak=weak)
@@ -104,6 +107,16 @@ def assemble(
         structure=structure_summary(solution.structure, tuple(guesses)),
     )
     return unmet_requirements(result, config)
+
+
+def height_is_used(terms: Sequence[StructureTerm], target: bool) -> bool:
+    """Whether the ground that the vehicle stands on was seen, by strips or, with a target, planes.
+
+    Without motion data it is in the statement of the odometry.
+    """
+    if any(term.stance is not None or term.odometry_of for term in terms):
+        return True
+    return target and all(term.on_ground for term in terms)
 
 
 def evidence_of_terms(terms: Sequence[StructureTerm], target: bool) -> Evidence:

@@ -109,7 +109,12 @@ class Estimate:
     def stands(self) -> Stands:
         """The level strip below each pose with a scan, where there is one."""
         t_map_vehicle = self.state.t_map_vehicle
-        stands = stands_of(t_map_vehicle, self.strips.centres_map, self.strips.normals_map)
+        stands = stands_of(
+            t_map_vehicle,
+            self.strips.centres_map,
+            self.strips.normals_map,
+            self.problem.standing,
+        )
         return stands.only(np.isin(stands.pose, self.problem.pose_of_scan))
 
 

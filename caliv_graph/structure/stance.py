@@ -14,7 +14,7 @@ import numpy as np
 from caliv_graph.products import Array, Stance, StandingErrors
 from caliv_graph.structure.elimination import marginal
 from caliv_graph.structure.solve import Solved
-from caliv_graph.structure.standing import Standing, tilt_rows
+from caliv_graph.structure.standing import Standing, above_ground_m, tilt_rows
 
 STANDING = 3
 """Coordinates of the errors of height and tilt in a system."""
@@ -51,6 +51,18 @@ def mean_tilt(found: Solved) -> MeanTilt | None:
     )
     on_rest, cov = found.system.surfaces.reduced(rows)
     return MeanTilt(value, on_rest, cov + sigma**2 * np.eye(2))
+
+
+def strips_above_ground_m(found: Solved) -> float:
+    """`standing.above_ground_m` of a solved drive."""
+    state = found.state
+    return above_ground_m(
+        found.problem.standing,
+        found.stands(),
+        state.t_map_vehicle,
+        state.centres_map,
+        state.normals_map,
+    )
 
 
 def stance_of(

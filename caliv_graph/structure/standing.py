@@ -24,6 +24,19 @@ strip."""
 STEP_M = 0.05
 """Largest difference of a height above a strip from the median: kerbs are higher."""
 
+TOO_HIGH_M = 0.5
+"""A level strip that is higher than this above where `vehicle_height` has the ground carries no
+wheels, beside three of its sigmas. Guesses leave the height of all LiDARs open by less: tape
+measures and drawings are good to a decimetre. Decks, roofs and benches are higher."""
+
+FITTING = 0.1
+"""Part of the poses above level strips that are above one that is not too high, at least. Where
+fewer are, all strips count: a wrong `vehicle_height` has all of them too high, and the result shows
+that it contradicts them."""
+
+BESIDE = 4
+"""Level strips next to a pose among which the one below it is looked for."""
+
 
 @dataclass(frozen=True)
 class Standing:
@@ -56,27 +69,66 @@ class Stands:
         return Stands(self.pose[keep], self.strip[keep])
 
 
-def stands_of(t_map_vehicle: Array, centres_map: Array, normals_map: Array) -> Stands:
+def stands_of(
+    t_map_vehicle: Array,
+    centres_map: Array,
+    normals_map: Array,
+    standing: Standing | None = None,
+) -> Stands:
     """The level strip below each pose, where there is one.
 
     Args:
         t_map_vehicle: (M, 3) metres.
         centres_map: (K, 3) of all strips.
         normals_map: (K, 3).
+        standing: what is known; where other strips are, those far above the ground by it count
+            not.
     """
     level = np.flatnonzero(normals_map[:, 2] > LEVEL)
     none = np.zeros(0, dtype=np.int64)
     if not len(level) or not len(t_map_vehicle):
         return Stands(none, none)
-    found = cKDTree(centres_map[level, :2]).query(t_map_vehicle[:, :2])
-    apart, nearest = np.asarray(found[0]), np.asarray(found[1], dtype=np.int64)
-    below = np.flatnonzero(apart < 0.5 * np.sqrt(2.0) * CELL_M)
-    strip = level[nearest[below]]
-    away = t_map_vehicle[below] - centres_map[strip]
-    height = np.einsum("si,si->s", normals_map[strip], away)
+    found = cKDTree(centres_map[level, :2]).query(t_map_vehicle[:, :2], np.arange(1, BESIDE + 1))
+    apart, beside = np.asarray(found[0]), np.asarray(found[1], dtype=np.int64)
+    near = apart < 0.5 * np.sqrt(2.0) * CELL_M
+    strip = level[np.where(near, beside, 0)]
+    away = t_map_vehicle[:, None] - centres_map[strip]
+    heights = np.einsum("mki,mki->mk", normals_map[strip], away)
+    fitting = near & (heights > _least_height_m(standing))
+    if fitting.any(axis=1).sum() > FITTING * near.any(axis=1).sum():
+        near = fitting
+    below = np.flatnonzero(near.any(axis=1))
+    first = below, near[below].argmax(axis=1)
+    strip, height = strip[first], heights[first]
     # The nearest strip may be a kerb beside the wheels.
     usual = np.abs(height - np.median(height)) < STEP_M if len(height) else below > 0
     return Stands(below[usual], strip[usual])
+
+
+def _least_height_m(standing: Standing | None) -> float:
+    """Least height of the vehicle frame above a strip that may carry the wheels."""
+    if standing is None or standing.height_m is None:
+        return -np.inf
+    return standing.height_m - TOO_HIGH_M - 3.0 * standing.height_sigma_m
+
+
+def above_ground_m(
+    standing: Standing,
+    stands: Stands,
+    t_map_vehicle: Array,
+    centres_map: Array,
+    normals_map: Array,
+) -> float:
+    """How far above the ground by the known height the strips of the stands are, by the median.
+
+    Zero where they may carry the wheels, there are none, or no height is known. Arguments are as of
+    `standing_rows`, at the estimate: what is wrong with the height has moved the LiDARs there.
+    """
+    if standing.height_m is None or not len(stands.pose):
+        return 0.0
+    away = t_map_vehicle[stands.pose] - centres_map[stands.strip]
+    height_m = float(np.median(np.einsum("si,si->s", normals_map[stands.strip], away)))
+    return 0.0 if height_m > _least_height_m(standing) else standing.height_m - height_m
 
 
 def standing_rows(

@@ -33,7 +33,14 @@ from caliv_graph.structure.relative import (
     start_about,
 )
 from caliv_graph.structure.solve import Solved, solve_structure
-from caliv_graph.structure.stance import STANDING, MeanTilt, mean_tilt, stance_of, standing_errors
+from caliv_graph.structure.stance import (
+    STANDING,
+    MeanTilt,
+    mean_tilt,
+    stance_of,
+    standing_errors,
+    strips_above_ground_m,
+)
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.strips import LEVEL
 from caliv_graph.structure.thickness import (
@@ -267,6 +274,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     tilt = mean_tilt(found)
     of_tilt = np.zeros((0, len(system.H))) if tilt is None else tilt.rows
     state, names = found.state, found.problem.patches.lidars
+    above_m = strips_above_ground_m(found)
     term = partial(
         StructureTerm,
         drive=found.problem.patches.drive,
@@ -281,6 +289,8 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         clocks=found.clocks.late,
         clocks_apart=found.clocks.apart,
         channels=channel_sizes(found),
+        warnings=(_no_ground(found.problem.patches.drive, above_m),) if above_m else (),
+        on_ground=not above_m,
     )
     stated, frame = found.problem.standing, frame_sigmas(found.nuisances)
     known, offset = prior.parameter_information, prior.parameter_offset
@@ -312,8 +322,18 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     return term(
         information=information,
         gradient=gradient,
-        stance=stance,
+        stance=None if above_m else stance,
         standing=None if tilt is None else standing,
+    )
+
+
+def _no_ground(drive: int, above_m: float) -> str:
+    """The warning that the level surfaces below the vehicle carry no wheels."""
+    return (
+        f"drive {drive + 1}: the level surfaces below the vehicle are {above_m:.2f} m above the "
+        "ground by ground.vehicle_height: the wheels do not stand on them, and the height of the "
+        "LiDARs is not told by it. Set min_range of the LiDARs beyond the vehicle's own body, and "
+        "check ground.vehicle_height and the z of the guesses"
     )
 
 

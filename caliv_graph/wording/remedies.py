@@ -153,8 +153,11 @@ REMEDIES: dict[Evidence, Remedies] = {
 _HEIGHT = "measure the height of the vehicle frame above the ground and set ground.vehicle_height "
 
 
-def with_height_set(direction: Direction, sigma_m: float) -> Direction:
-    """A direction whose remedy does not ask for the height of the vehicle, which the config has."""
+def with_height_set(direction: Direction, sigma_m: float, stands: bool) -> Direction:
+    """A direction whose remedy does not ask for the height of the vehicle, which the config has.
+
+    `stands`: the height is used, as the ground that the vehicle stands on is seen.
+    """
     if not direction.remedy.startswith(_HEIGHT):
         return direction
     _, _, manoeuvre = direction.remedy.partition(", or ")
@@ -162,6 +165,10 @@ def with_height_set(direction: Direction, sigma_m: float) -> Direction:
         f"measure ground.vehicle_height better than its ground.sigma of {1e3 * sigma_m:.3g} mm, "
         "and set both"
     )
+    if not stands:
+        remedy = (
+            "let the LiDARs see the ground that the vehicle drives over, for ground.vehicle_height"
+        )
     return replace(direction, remedy=f"{remedy}, or {manoeuvre}" if manoeuvre else remedy)
 
 

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.calibration.assemble import height_is_used
 from caliv_graph.calibration.graph import (
     CalibrationGraph,
     initial_values,
@@ -28,6 +29,7 @@ from caliv_graph.products import (
     Array,
     IntArray,
     PoseNoise,
+    Stance,
     StandingErrors,
     StructureTerm,
     Trajectory,
@@ -369,3 +371,16 @@ def test_a_lidar_or_a_pose_that_the_problem_lacks_is_refused() -> None:
             ),
             [replace(term, T_vehicle_lidar={"front": term.T_vehicle_lidar["front"]})],
         )
+
+
+def test_the_height_of_the_vehicle_is_used_where_it_is_seen_to_stand() -> None:
+    term = term_of(given(), given().trajectory.stamps_ns[:2], ("front", "rear"))
+    stance = Stance(np.zeros(1), np.zeros((1, len(term.gradient))), np.eye(1), 0.005, False)
+    standing = replace(term, stance=stance)
+    assert height_is_used((standing,), target=False)
+    assert height_is_used((term, standing), target=False)
+    assert not height_is_used((term,), target=False)
+    # Planes of the ground stand where a target was seen and no strips stand for them.
+    assert height_is_used((term,), target=True)
+    assert not height_is_used((replace(term, on_ground=False),), target=True)
+    assert height_is_used((replace(term, odometry_of="front"),), target=False)

@@ -18,7 +18,13 @@ from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry, geometry_of
 from caliv_graph.structure.rows import whitened
 from caliv_graph.structure.sightings import Sightings
-from caliv_graph.structure.standing import Standing, Stands, standing_rows, stands_of
+from caliv_graph.structure.standing import (
+    Standing,
+    Stands,
+    above_ground_m,
+    standing_rows,
+    stands_of,
+)
 from caliv_graph.trajectory.rates import RATES
 
 LAYOUT = Layout(
@@ -291,6 +297,42 @@ def test_a_vehicle_stands_on_the_strip_below_it_only() -> None:
     stands = stands_of(at, centres, normals)
     assert stands.pose.tolist() == [0, 1]
     assert stands.strip.tolist() == [0, 1]
+
+
+def test_the_vehicle_stands_on_the_ground_and_not_on_its_own_roof() -> None:
+    """Most strips near the poses are a roof, 1.2 m above the vehicle frame; the ground is 0.3 m
+    below the frame."""
+    x = 2.0 * np.arange(8.0)
+    roof = np.column_stack([x, 0.1 + 0.0 * x, 1.2 + 0.0 * x])
+    floor = np.column_stack([x, 0.5 + 0.0 * x, -0.3 + 0.0 * x])[:3]
+    at = np.column_stack([x, 0.0 * x, 0.0 * x])
+    normals = np.tile([0.0, 0.0, 1.0], (11, 1))
+    both = np.vstack([roof, floor])
+    stands = stands_of(at, both, normals, STANDING)
+    assert (stands.pose.tolist(), stands.strip.tolist()) == ([0, 1, 2], [8, 9, 10])
+    assert above_ground_m(STANDING, stands, at, both, normals) == 0.0
+    # Without a height nothing tells which of them carries the wheels.
+    unknown = replace(STANDING, height_m=None)
+    assert stands_of(at, both, normals, unknown).strip.tolist() == list(range(8))
+    assert stands_of(at, both, normals).strip.tolist() == list(range(8))
+    # So does a height with such a sigma.
+    vague = replace(STANDING, height_sigma_m=0.5)
+    assert stands_of(at, both, normals, vague).strip.tolist() == list(range(8))
+
+
+def test_strips_that_are_all_too_high_stay_and_are_told() -> None:
+    """A wrong height of the vehicle makes them so, and the result is to show it."""
+    at = np.array([[0.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
+    centres = np.array([[0.0, 0.1, 0.9], [2.0, 0.1, 0.9]])
+    normals = np.tile([0.0, 0.0, 1.0], (2, 1))
+    high = replace(STANDING, height_m=1.3)
+    stands = stands_of(at, centres, normals, high)
+    assert stands.strip.tolist() == [0, 1]
+    assert above_ground_m(high, stands, at, centres, normals) == pytest.approx(1.2)
+    near = replace(STANDING, height_m=0.6)
+    assert above_ground_m(near, stands, at, centres, normals) == 0.0
+    nothing = Stands(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    assert above_ground_m(high, nothing, at, centres, normals) == 0.0
 
 
 def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them() -> None:

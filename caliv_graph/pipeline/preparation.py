@@ -39,6 +39,7 @@ from caliv_graph.products import (
 from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.readers.empty import CountedRecording
 from caliv_graph.readers.pose_pauses import without_pauses
+from caliv_graph.structure.own_body import without_own_body
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.read import ground_roughness_m, read_patches
 from caliv_graph.structure.without_targets import without_targets
@@ -60,7 +61,11 @@ from caliv_graph.wording.mounting import (
     region_sentence,
 )
 from caliv_graph.wording.odometry import odometry_sentence
-from caliv_graph.wording.structure import no_target_sentence, rough_ground_sentence
+from caliv_graph.wording.structure import (
+    no_target_sentence,
+    own_body_sentence,
+    rough_ground_sentence,
+)
 from caliv_graph.wording.suspects import motion_sentence
 
 
@@ -157,10 +162,10 @@ def prepare(
         recordings, config, motions, raw, progress, refused
     )
     config, misplaced, observations, no_target, wrong = search
-    patches = tuple(
-        without_targets(of, observations, rough[of.drive], config)
-        for of in _patches(recordings, rough, config, progress)
+    patches, of_body = _without_own_body(
+        _patches(recordings, rough, config, progress), rough, config
     )
+    patches = tuple(without_targets(p, observations, rough[p.drive], config) for p in patches)
     config, on_grass = _on_rough_ground(config, recordings, patches, rough)
     kept = kept_stamps(patches, usable(observations))
     if no_target is not None and not kept:
@@ -185,6 +190,7 @@ def prepare(
     warnings += [w for o in observations for w in o.warnings]
     if no_target is not None:
         warnings.append(no_target_sentence(no_target.what))
+    warnings += of_body
     warnings += on_grass
     return Prepared(
         tuple(trajectories),
@@ -294,6 +300,20 @@ def _patches(
     if not _uses(config):
         return ()
     return read_patches(recordings, trajectories, config, progress, keep_level=True)
+
+
+def _without_own_body(
+    patches: Sequence[DrivePatches], trajectories: Sequence[VehicleTrajectory], config: Config
+) -> tuple[tuple[DrivePatches, ...], tuple[str, ...]]:
+    """The patches that are not on the vehicle; warnings of LiDARs that see it, one of each."""
+    out, seen = [], dict[str, tuple[float, float]]()
+    for of in patches:
+        rest, found = without_own_body(of, trajectories[of.drive], config)
+        out.append(rest)
+        for body in found:
+            share, reach_m = seen.get(body.lidar, (0.0, 0.0))
+            seen[body.lidar] = max(share, body.share), max(reach_m, body.reach_m)
+    return tuple(out), tuple(own_body_sentence(name, *found) for name, found in seen.items())
 
 
 ROUGH_M = 0.008

@@ -29,6 +29,7 @@ from caliv_graph.structure.distances import (
     other_strips,
 )
 from caliv_graph.structure.held_out import HeldOut, hold_out
+from caliv_graph.structure.own_body import without_own_body
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.problem import Problem, first_state, part_of, placed_patches
 from caliv_graph.structure.read import read_patches
@@ -105,6 +106,7 @@ def measure_held_out(
     names = list(extrinsics.T_vehicle_lidar)
     config = config.model_copy(update={"lidars": {n: config.lidars[n] for n in names}})
     (patches,) = read_patches([recording], [rough], config, progress, keep_level=True)
+    patches, _ = without_own_body(patches, rough, config)
     if not len(patches.scan):
         return _nothing("no LiDAR sees flat surfaces")
     with progress.stage("calibrating without a third of the structure", None):

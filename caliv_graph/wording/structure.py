@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+
+SPARE_TENTHS = 4.0
+"""Decimetres beyond the middle of the farthest piece of the vehicle: half a piece, and rounding."""
 
 
 def no_target_sentence(what: str) -> str:
@@ -63,6 +67,17 @@ def rough_ground_sentence(
         f"or gravel does: LiDARs see its tips, wheels sink in. {height}each LiDAR's ground is "
         f"believed to {1e3 * tilt_rad:.2f} mrad of tilt, in all drives. For {better} use drives on "
         "asphalt or concrete alone"
+    )
+
+
+def own_body_sentence(lidar: str, share: float, reach_m: float) -> str:
+    """The warning that a LiDAR sees the vehicle; part of its flat pieces, and how far away."""
+    enough_m = math.floor(10.0 * reach_m + SPARE_TENTHS) / 10.0
+    return (
+        f"lidar '{lidar}' sees the vehicle itself: {100.0 * share:.2g} % of its flat pieces are "
+        f"level ones up to {reach_m:.1f} m away that move with it, well above the ground. They are "
+        "left out of walls and ground; other stages still have the points. Set "
+        f"lidars.{lidar}.min_range to {enough_m:.1f} m or to what is beyond the vehicle"
     )
 
 

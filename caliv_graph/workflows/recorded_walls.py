@@ -19,6 +19,7 @@ from caliv_graph.planning.recorded_walls import RecordedWalls
 from caliv_graph.products import Recording
 from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.structure.noise import range_sigmas
+from caliv_graph.structure.own_body import without_own_body
 from caliv_graph.structure.read import level, read_patches
 from caliv_graph.structure.solve import solve_structure
 from caliv_graph.structure.term import aligned_start, problem_of, usable
@@ -69,6 +70,7 @@ def solved_walls(
         return None
     recording = with_common_stamps(recording)
     (patches,) = read_patches([recording], [rough], config, progress, keep_level=True)
+    patches, _ = without_own_body(patches, rough, config)
     if not len(patches.scan):
         return None
     with progress.stage("joining the walls", None):

@@ -85,6 +85,7 @@ class Spinner:
         azimuths_deg: of its columns.
         sigma_m: noise along the beam.
         sweep_s: from the first column to the last; stamps are those of the first.
+        body: what moves with the vehicle, in its frame; returns from within 1 m are not reported.
     """
 
     T_vehicle_lidar: gtsam.Pose3
@@ -92,6 +93,7 @@ class Spinner:
     azimuths_deg: Array = field(default_factory=lambda: np.linspace(-60.0, 60.0, 330))
     sigma_m: float = 0.01
     sweep_s: float = 0.0
+    body: World | None = None
 
     def beams(self) -> tuple[Array, Array]:
         """Unit beams (N, 3) in the LiDAR's frame, and their times (N,)."""
@@ -124,6 +126,10 @@ class Spinner:
         origin = t + R @ t_extrinsic[0]
         R = R @ R_extrinsic[0]
         ranges = world.ranges(origin[column], np.einsum("nij,nj->ni", R[column], beams))
+        if self.body is not None:
+            mounted = np.repeat(t_extrinsic, len(beams), axis=0)
+            own = self.body.ranges(mounted, beams @ R_extrinsic[0].T)
+            ranges = np.where(own < ranges, np.where(own > 1.0, own, np.inf), ranges)
         ranges += rng.normal(0.0, self.sigma_m, len(ranges)) if self.sigma_m else 0.0
         seen = ranges < 80.0
         points = beams[seen] * ranges[seen, None]

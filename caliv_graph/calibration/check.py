@@ -147,7 +147,8 @@ def check(
 
 def _given(motions: Mapping[int, MotionData], config: Config) -> PosesGiven | None:
     """The poses that were given; None: some drive has raw sensors."""
-    if not all(takes_given_poses(motion, config) for motion in motions.values()):
+    given = [takes_given_poses(motion, config) for motion in motions.values()]
+    if not given or not all(given):
         return None
     frames = [motion.poses.frame for motion in motions.values() if motion.poses is not None]
     alike = frames and all(each == frames[0] for each in frames[1:])

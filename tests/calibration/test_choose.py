@@ -158,14 +158,15 @@ def test_guesses_that_are_off_alike_are_named_as_the_solve_names_them() -> None:
     seen, path, config = [observation(CHAIR)], [trajectory()], guessed(off, in_vehicle=True)
     assert displaced(seen, path, config) == ()
 
-    front, rear = displaced_or_misguessed(seen, path, config, ["front", "rear"])
+    (both,) = displaced_or_misguessed(seen, path, config, ["front", "rear"])
 
-    assert front.startswith("lidar 'front': ")
-    assert "yaw differs from the initial guess" in front
+    assert both.startswith("lidars 'front' and 'rear': the initial guesses of all are off by the")
+    assert "-15.0) degrees (roll, pitch, yaw)" in both
+    # What another search replaced is said there.
+    (rear,) = displaced_or_misguessed(seen, path, config, ["rear"])
+    assert rear.startswith("lidar 'rear': ")
     assert "yaw differs from the initial guess" in rear
     assert "T_vehicle_lidar and not its inverse" in rear
-    # What another search replaced is said there.
-    assert displaced_or_misguessed(seen, path, config, ["rear"]) == (rear,)
 
 
 def test_nothing_is_said_of_a_good_drive_from_rough_guesses() -> None:

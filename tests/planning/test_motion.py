@@ -260,13 +260,15 @@ def test_grounds_information_is_that_of_numerical_derivatives() -> None:
         foot = np.array([*anchor[:2], height + anchor[2]])
         T = X.compose(E)
         rises = ground_by_range_bias(scan.scenario.lidars["front"])
-        rises = rises @ d[6 + columns.all_biases]
+        rises = rises @ d[6 + columns.all_biases[:3]]
+        seen_turned = gtsam.Rot3.Expmap(d[6 + columns.all_biases[3:]])
+        R = X.rotation().compose(seen_turned).compose(E.rotation()).matrix()
         normal_seen = normal + X.rotation().matrix()[:, :2] @ rises[:2]
         over = normal @ (T.translation() - foot) + rises[2]
         stands = normal @ (X.translation() - foot) - error
         return np.concatenate(
             [
-                T.rotation().matrix().T @ normal_seen / NORMAL_FLOOR_RAD,
+                R.T @ normal_seen / NORMAL_FLOOR_RAD,
                 [over / DISTANCE_FLOOR_M, stands / math.hypot(0.005, DISTANCE_FLOOR_M)],
             ]
         )

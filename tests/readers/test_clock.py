@@ -96,3 +96,9 @@ def test_a_topic_that_stops_halfway_is_named() -> None:
     # One message in 10 s ends when it does.
     rare = read_clock(times[::100], times[::100])
     assert clock_warnings("bag", {"/imu": whole, "/pose": rare}) == []
+    # One message has no end; of headers that are partly unset, of another epoch, none is told.
+    once = read_clock(times[:1], times[:1])
+    assert clock_warnings("bag", {"/imu": whole, "/map": once}) == []
+    partly = np.where(np.arange(300) < 20, 0, times - 1_699_999_000_000_000_000)
+    clocks = {"/imu": whole, "/l": read_clock(partly, times)}
+    assert not any("of the topics" in line for line in clock_warnings("bag", clocks))

@@ -26,7 +26,7 @@ from caliv_graph.registration.register import JointRegistration, register_jointl
 from caliv_graph.targets.cloud.choice import Choice, TriedCandidate
 from caliv_graph.targets.cloud.scans import thinned
 from caliv_graph.targets.search.place import WIDE_SIGMAS, Place, Sightings, fit_place
-from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory, twists_at
+from caliv_graph.trajectory.select import VehicleTrajectory, are_given, twists_at
 from caliv_graph.uncertainty.consistency import against_guesses, together
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
 from caliv_graph.wording.contradictions import PosesGiven, contradiction_sentence
@@ -166,8 +166,7 @@ def displaced_or_misguessed(
             speed_m_s = float(np.median(np.linalg.norm(of.sightings.twists[:, 3:], axis=1)))
             lidars = {n: _as_result(n, of.place, config) for n in of.place.cov if n in given}
             found = together(tuple(against_guesses(lidars, speed_m_s)), lidars)
-            of_poses = all(isinstance(t, GivenTrajectory) for t in trajectories)
-            poses = PosesGiven(poses_source(config)) if of_poses else None
+            poses = PosesGiven(poses_source(config)) if are_given(trajectories) else None
             out.update((contradiction_sentence(each, given=poses), None) for each in found)
     return tuple(out)
 

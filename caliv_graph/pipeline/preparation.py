@@ -49,8 +49,8 @@ from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import (
-    GivenTrajectory,
     VehicleTrajectory,
+    are_given,
     noise_scales,
     smooth_trajectories,
     takes_given_poses,
@@ -85,7 +85,7 @@ class Prepared:
         patches: pieces of walls and other surfaces, per drive; empty: structure is not used.
         no_target: why no target was found; None: one was, or none was to be looked for.
         mistakes: of the config, that explain why LiDARs do not see the target, a sentence each.
-        misplaced: those of `contradictions` about guesses that the search had to replace.
+        misplaced: beside `contradictions`, those of guesses that the search had to replace.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -199,7 +199,7 @@ def prepare(
         findings,
         (*warnings, *ground_warnings, *warnings_of(findings)),
         config,
-        (*misplaced, *displaced(observations, trajectories, config)),
+        displaced(observations, trajectories, config),
         patches,
         no_target,
         wrong,
@@ -399,8 +399,7 @@ def targets_of(
     searched = (
         find_target(recordings, trajectories, config, progress) if config.target is None else []
     )
-    given = all(isinstance(trajectory, GivenTrajectory) for trajectory in trajectories)
-    config, misplaced = realigned(config, searched, given)
+    config, misplaced = realigned(config, searched, are_given(trajectories))
     observations = extract_targets(
         recordings, trajectories, config, progress, choose_static, searched
     )

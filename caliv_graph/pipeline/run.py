@@ -158,9 +158,11 @@ def _calibrated(
             structure_evidence(prepared),
         )
     except TargetError as error:
-        causes = _causes(recordings, prepared, motions, guessed, progress)
-        if causes:
-            raise TargetError(error.what, causes) from error
+        # What is left-handed all about, or far from where the guess has it, stands still nowhere.
+        if not prepared.mistakes:
+            causes, _ = _mistakes(recordings, prepared, motions, guessed, progress)
+            if causes:
+                raise TargetError(error.what, " ".join(causes)) from error
         raise without_anything(prepared, error) from error
     with progress.stage("checking the result", None):
         calibration = assemble(
@@ -178,7 +180,7 @@ def _calibrated(
             trajectories,
             motions,
             prepared.config,
-            displaced=bool(prepared.contradictions),
+            displaced=bool(prepared.misplaced or prepared.contradictions),
         )
         names = [recording.name for recording in recordings]
         clocks = clock_findings(names, solution.structure, calibration)
@@ -187,20 +189,13 @@ def _calibrated(
         said, unread = prepared.mistakes, ""
         blamed = _blamed(calibration, concerned)
         if not said and prior is None and blamed is not None:
-            raw, smoothed = raw_findings(motions, guessed), prepared.trajectories
-            try:
-                found = mistakes(
-                    recordings, smoothed, motions, guessed, progress, raw, blamed=blamed
-                )
-            except CalivError as error:
-                found, unread = (), f"usual mistakes of the config were not looked for: {error}"
-            said = tuple(mistake_sentence(doubt, guessed) for doubt in found)
-        before = prepared.contradictions
+            said, unread = _mistakes(recordings, prepared, motions, guessed, progress, blamed)
+        before = (*prepared.misplaced, *prepared.contradictions)
         if said:
             # What a solve from a mistaken guess or heading contradicts has that cause, and so has
             # what the search takes for guesses that are off.
             calibration = replace(calibration, contradictions=())
-            before = tuple(each for each in before if each not in prepared.misplaced)
+            before = prepared.contradictions
         calibration = contradicted(
             ranked_with(calibration, findings),
             (*said, *before),
@@ -222,25 +217,24 @@ def _calibrated(
     return run, bool(said)
 
 
-def _causes(
+def _mistakes(
     recordings: Sequence[Recording],
     prepared: Prepared,
     motions: dict[int, MotionData],
     config: Config,
     progress: Progress,
-) -> str:
-    """Mistakes that explain why structure tells nothing, if they were not looked for; or nothing.
+    blamed: Sequence[str] = (),
+) -> tuple[tuple[str, ...], str]:
+    """A sentence for each usual mistake that is found; and why none was looked for, or nothing.
 
-    What is left-handed all about, or far from where the guess has it, stands still nowhere.
+    `blamed` are LiDARs whose guess a solve contradicts.
     """
-    if prepared.mistakes:
-        return ""
-    raw = raw_findings(motions, config)
+    raw, smoothed = raw_findings(motions, config), prepared.trajectories
     try:
-        found = mistakes(recordings, prepared.trajectories, motions, config, progress, raw)
-    except CalivError:
-        return ""
-    return " ".join(mistake_sentence(doubt, config) for doubt in found)
+        found = mistakes(recordings, smoothed, motions, config, progress, raw, blamed=blamed)
+    except CalivError as error:
+        return (), f"usual mistakes of the config were not looked for: {error}"
+    return tuple(mistake_sentence(doubt, config) for doubt in found), ""
 
 
 def _blamed(calibration: Calibration, concerned: Sequence[str]) -> tuple[str, ...] | None:

@@ -160,6 +160,11 @@ def takes_given_poses(motion: MotionData, config: Config) -> bool:
     return config.names_poses() or (motion.poses is not None and motion.imu is None)
 
 
+def are_given(trajectories: Sequence[VehicleTrajectory]) -> bool:
+    """Whether the trajectories of all drives are given poses."""
+    return all(isinstance(trajectory, GivenTrajectory) for trajectory in trajectories)
+
+
 def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     trajectory = given_trajectory(motion)
     begin, end = GivenTrajectory(trajectory).span_ns

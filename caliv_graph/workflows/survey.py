@@ -105,6 +105,7 @@ def survey(recordings: Sequence[Recording], config: Config, progress: Progress) 
         names=tuple(recording.name for recording in recordings),
         warnings=(
             *notes,
+            *prepared.misplaced,
             *prepared.contradictions,
             *contradictions_of(prepared.findings),
             *prepared.warnings,

@@ -24,8 +24,8 @@ from caliv_graph.targets.search import FoundTarget, find_target
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 REMEDY = (
-    "Move or widen target.min/max, check the initial guesses, or run 'caliv-graph inspect' with "
-    "the config"
+    "Move or widen target.min/max, or leave target out: it is then searched for; or check the "
+    "initial guesses: run 'caliv-graph inspect' with the config"
 )
 
 SCANS_OF_A_PLACE = 10

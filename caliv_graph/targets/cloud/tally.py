@@ -67,7 +67,10 @@ class Tally:
         if worst.startswith("under "):
             return "Pass the target more slowly, or nearer, on the side that this LiDAR sees"
         if is_given:
-            return "Widen target.min/max or run 'caliv-graph inspect'"
+            return (
+                "Move or widen target.min/max, or leave target out: it is then searched for; "
+                "'caliv-graph inspect' shows who sees it when"
+            )
         return (
             "Check its initial guess, and drive so that it passes the target; 'caliv-graph "
             "inspect' shows who sees it when"

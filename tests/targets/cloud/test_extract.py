@@ -757,7 +757,8 @@ def test_a_lidar_that_sees_nothing_is_left_out_and_the_others_kept() -> None:
     assert [c.lidar for c in observation.clouds] == ["front"] * 9
     assert observation.warnings == (
         "target: lidar 'rear' sees it in 0 scans, needs 8 (extraction.min_scans). Of 9 scans: "
-        "9 outside the region. Widen target.min/max or run 'caliv-graph inspect'",
+        "9 outside the region. Move or widen target.min/max, or leave target out: it is then "
+        "searched for; 'caliv-graph inspect' shows who sees it when",
     )
 
 

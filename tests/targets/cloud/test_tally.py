@@ -28,7 +28,7 @@ def test_fewer_points_are_proposed_only_where_they_would_suffice() -> None:
 @pytest.mark.parametrize(
     ("why", "is_given", "words"),
     [
-        (OUTSIDE, True, "Widen target.min/max"),
+        (OUTSIDE, True, "or leave target out"),
         (OUTSIDE, False, "Check its initial guess"),
         (MOVED, True, "Check its initial guess, its stamps"),
         (EMPTY, True, "min_range and max_range"),

@@ -42,8 +42,13 @@ from caliv_graph.uncertainty.consistency import (
     RangesDisagree,
     ScoreTest,
     Strain,
+    perhaps_together,
 )
-from caliv_graph.wording.contradictions import PosesGiven, contradiction_sentence
+from caliv_graph.wording.contradictions import (
+    PosesGiven,
+    contradiction_sentence,
+    together_doubt,
+)
 from caliv_graph.wording.offsets import late_clock_sentences
 from caliv_graph.wording.suspects import doubt_sentence, ranking_sentence
 
@@ -138,7 +143,13 @@ def check(
         for index, heading in headings.items()
         if heading.warning and not turned and drives[index] not in said
     )
-    doubts = filter(None, [doubt_sentence(suspects)])
+    doubts = list(filter(None, [doubt_sentence(suspects)]))
+    of_guesses = any(isinstance(each, GuessContradiction | GuessesTogether) for each in found)
+    frame = None if leads or of_guesses else perhaps_together(calibration.lidars)
+    if (of_all or frame is not None) and suspects and suspects[0].input.endswith(".initial"):
+        doubts = []
+    if frame is not None:
+        doubts.append(together_doubt(frame, given))
     # Beside what is most likely wrong, an offset is what that does to a clock.
     late = () if leads else tuple(late_clock_sentences(calibration.vehicle))
     concerned = tuple(name for name in calibration.lidars if any(name in _about(f) for f in found))

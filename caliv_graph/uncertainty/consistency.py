@@ -13,7 +13,7 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from scipy.special import bdtrc, chdtrc, chdtri, ndtr
+from scipy.special import bdtrc, chdtrc, chdtri, ndtr, ndtri
 
 from caliv_graph.conventions import AXES
 from caliv_graph.geometry.se3 import (
@@ -35,6 +35,9 @@ TOGETHER_SIGMAS = 3.0
 TOGETHER_P = 0.1
 """Chance by which guesses of one wrong frame are told as ones that are off each for itself. Two,
 one 3.3 sigmas off in x and one in y, would pass for one motion at 0.09."""
+
+PERHAPS_P = 0.01
+"""The same where none is contradicted: that their mean is off tells already that all are."""
 
 TOGETHER_LEFT = 0.25
 """Part of the squares of the differences that a common motion may leave at most."""
@@ -358,8 +361,12 @@ Contradiction = (
 
 def contradictions(inputs: CheckInputs) -> tuple[Contradiction, ...]:
     """All tests: what contradicts what; empty if nothing is wrong."""
+    guesses = together(tuple(against_guesses(inputs.lidars, inputs.speed_m_s)), inputs.lidars)
+    frame = perhaps_together(inputs.lidars)
+    if frame is not None and frame.sigmas > CONTRADICTION_SIGMAS:
+        guesses = (frame,)
     return (
-        *together(tuple(against_guesses(inputs.lidars, inputs.speed_m_s)), inputs.lidars),
+        *guesses,
         *(count for count in inputs.counts if too_many_outliers(count)),
         *coarse_registrations(inputs),
         *disagreeing_ranges(inputs),
@@ -449,16 +456,84 @@ def together(
     Not where one LiDAR is at the guess of another, where some guess is right as it is, where a
     trusted extrinsic tells that the frame is right, or where x, y or a rotation is undetermined.
     """
+    swapped = any(each.swapped_with is not None for each in found)
+    if not found or swapped:
+        return tuple(found)
+    common = _common(lidars, TOGETHER_P)
+    if common is None or min(float(off.max()) for off in common.as_given) < TOGETHER_SIGMAS:
+        return tuple(found)
+    late = [each.late_s for each in found if each.late_s is not None]
+    late_s = float(np.median(late)) if len(late) == len(found) else None
+    speed_m_s = found[0].speed_m_s
+    return (
+        GuessesTogether(
+            lidars=common.lidars,
+            T_vehicle_guessed=common.T_vehicle_guessed,
+            sigmas=max(float(off.max()) for off in common.as_given),
+            late_s=late_s,
+            speed_m_s=speed_m_s,
+            has_z=common.has_z,
+        ),
+    )
+
+
+def perhaps_together(lidars: Mapping[str, LidarResult]) -> GuessesTogether | None:
+    """Guesses that are off by one motion, though none of them is by 5 sigma; None: they are not.
+
+    The mean of their differences on each determined axis is tested, against the errors of the
+    guesses, which are independent, and those of the vehicle's poses, which all of them share.
+    """
+    common = _common(lidars, PERHAPS_P)
+    if common is None or max(float(off.max()) for off in common.as_given) > CONTRADICTION_SIGMAS:
+        return None
+    tested = [*_tested(lidars).values()]
+    off = np.array(
+        [
+            vehicle_axes_difference(lidar.T_vehicle_lidar, guess.T_vehicle_lidar)
+            for lidar, guess in tested
+        ]
+    )
+    guessed = np.array([guess.sigmas**2 for _, guess in tested])
+    shared = np.array([_sigmas(*each) ** 2 for each in tested]) - guessed
+    variance = guessed.sum(axis=0) / len(tested) ** 2 + shared.max(axis=0)
+    axes = 6 if common.has_z else 5
+    chi_square = float((off.mean(axis=0) ** 2 / variance)[:axes].sum())
+    sigmas = float(-ndtri(0.5 * max(chdtrc(axes, chi_square), 1e-300)))
+    if sigmas <= DOUBT_SIGMAS:
+        return None
+    return GuessesTogether(common.lidars, common.T_vehicle_guessed, sigmas, None, 0.0, common.has_z)
+
+
+@dataclass(frozen=True)
+class _Common:
+    """A motion of the vehicle frame that brings all guesses to the estimates.
+
+    Attributes:
+        lidars: that were tested.
+        T_vehicle_guessed: the motion.
+        as_given: per LiDAR, differences of the estimate from the guess on determined axes, sigmas.
+        has_z: whether z is determined for all of them.
+    """
+
+    lidars: tuple[str, ...]
+    T_vehicle_guessed: gtsam.Pose3
+    as_given: list[Array]
+    has_z: bool
+
+
+def _common(lidars: Mapping[str, LidarResult], p: float) -> _Common | None:
+    """The motion that explains how all guesses are off; None: none does, or it is not told.
+
+    What it leaves has at least the probability `p`. It is not told where a trusted extrinsic tells
+    that the frame is right, or where x, y or a rotation is undetermined.
+    """
     tested = _tested(lidars)
     told = {
         name: np.array([of.determined[axis] for axis in AXES]) for name, (of, _) in tested.items()
     }
     trusted = any(of.guess is not None and of.guess.fixed and of.has_data for of in lidars.values())
-    swapped = any(each.swapped_with is not None for each in found)
-    if not found or len(tested) < 2 or swapped or trusted:
-        return tuple(found)
-    if not all(axes[:5].all() for axes in told.values()):
-        return tuple(found)
+    if len(tested) < 2 or trusted or not all(axes[:5].all() for axes in told.values()):
+        return None
     T_vehicle_guessed = common_motion(
         [lidar.T_vehicle_lidar for lidar, _ in tested.values()],
         [guess.T_vehicle_lidar for _, guess in tested.values()],
@@ -467,25 +542,12 @@ def together(
         [_off_sigmas(*tested[name], T)[told[name]] for name in tested]
         for T in (gtsam.Pose3(), T_vehicle_guessed)
     )
-    if min(float(off.max()) for off in as_given) < TOGETHER_SIGMAS:
-        return tuple(found)
     squares, left = (sum(float(off @ off) for off in offs) for offs in (as_given, moved))
     free = sum(len(off) for off in moved) - max(len(off) for off in moved)
-    if left > min(float(chdtri(free, TOGETHER_P)), TOGETHER_LEFT * squares):
-        return tuple(found)
-    late = [each.late_s for each in found if each.late_s is not None]
-    late_s = float(np.median(late)) if len(late) == len(found) else None
-    speed_m_s = found[0].speed_m_s
-    return (
-        GuessesTogether(
-            lidars=tuple(tested),
-            T_vehicle_guessed=T_vehicle_guessed,
-            sigmas=max(float(off.max()) for off in as_given),
-            late_s=late_s,
-            speed_m_s=speed_m_s,
-            has_z=all(bool(axes[5]) for axes in told.values()),
-        ),
-    )
+    if left > min(float(chdtri(free, p)), TOGETHER_LEFT * squares):
+        return None
+    has_z = all(bool(axes[5]) for axes in told.values())
+    return _Common(tuple(tested), T_vehicle_guessed, as_given, has_z)
 
 
 def _off_sigmas(lidar: LidarResult, guess: Guess, T_vehicle_guessed: gtsam.Pose3) -> Array:

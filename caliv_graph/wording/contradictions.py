@@ -118,8 +118,14 @@ def _guess(found: GuessContradiction) -> str:
     return f"lidar '{found.lidar}': {'; '.join(parts)}. {_guess_remedy(found)}"
 
 
-def _together(found: GuessesTogether, given: PosesGiven | None) -> str:
+def together_doubt(found: GuessesTogether, given: PosesGiven | None = None) -> str:
+    """Guesses that may be off by one motion, though none is contradicted by itself."""
+    return _together(found, given, f"may all be off by the same (together {found.sigmas:.1f}")
+
+
+def _together(found: GuessesTogether, given: PosesGiven | None, how: str | None = None) -> str:
     names = " and ".join(f"'{name}'" for name in found.lidars)
+    how = how or f"of all are off by the same ({found.sigmas:.0f}"
     x, y, z = (f"{value:+.2f}" for value in found.T_vehicle_guessed.translation() + 0.0)
     moved = f"{x}, {y}, {z if found.has_z else '-'}"
     turned = ", ".join(
@@ -134,7 +140,7 @@ def _together(found: GuessesTogether, given: PosesGiven | None) -> str:
             f"{found.speed_m_s:.1f} m/s have this effect, too"
         )
     return (
-        f"lidars {names}: the initial guesses of all are off by the same ({found.sigmas:.0f} "
+        f"lidars {names}: the initial guesses {how} "
         f"sigma): they fit if their vehicle frame is moved by ({moved}) m and turned by ({turned}) "
         "degrees (roll, pitch, yaw). "
         f"{different_frames(found.T_vehicle_guessed, source, frame)}{late}"

@@ -40,9 +40,14 @@ from caliv_graph.uncertainty.consistency import (
     heading_contradicted,
     lateness,
     p_value,
+    perhaps_together,
     too_many_outliers,
 )
-from caliv_graph.wording.contradictions import PosesGiven, contradiction_sentence
+from caliv_graph.wording.contradictions import (
+    PosesGiven,
+    contradiction_sentence,
+    together_doubt,
+)
 from tests.samples import MOUNTINGS, pose
 
 GUESS_SIGMAS = np.array([0.03] * 3 + [0.058] * 3)
@@ -210,6 +215,28 @@ def test_guesses_of_another_vehicle_frame_are_off_together() -> None:
         "rear",
         "left",
     }
+
+
+def test_guesses_that_are_each_off_too_little_are_told_by_what_they_have_in_common() -> None:
+    """Three, 3.5 sigma each in y: by chance their mean is as far off once in 500,000 rigs."""
+    off = along("y", 3.5 * float(GUESS_SIGMAS[4]))
+    lidars = {name: result(pose(*at), off) for name, at in MOUNTINGS.items()}
+    assert contradictions(CheckInputs(lidars=lidars)) == ()
+    found = perhaps_together(lidars)
+    assert found is not None
+    assert 4.5 < found.sigmas < 6.1
+    said = together_doubt(found)
+    assert "the initial guesses may all be off by the same" in said
+    assert "mounts of IMU, antenna and wheels" in said
+    far = {name: result(pose(*at), 1.3 * off) for name, at in MOUNTINGS.items()}
+    (beyond,) = contradictions(CheckInputs(lidars=far))
+    assert isinstance(beyond, GuessesTogether)
+    # The error of the poses is in all of them alike, and does not average.
+    wide = {name: replace(of, cov=of.cov + np.eye(6) * 0.05**2) for name, of in lidars.items()}
+    assert perhaps_together(wide) is None
+    # To opposite sides: each for itself, and not beyond 5 sigma.
+    lidars["rear"] = result(pose(*MOUNTINGS["rear"]), -off)
+    assert perhaps_together(lidars) is None
 
 
 def test_guesses_that_are_off_by_something_of_their_own_are_not_off_together() -> None:

@@ -165,6 +165,7 @@ def test_clocks_of_lidars_are_compared_with_each_other() -> None:
     assert found.sigmas == pytest.approx(6.71, abs=0.01)
     assert "drive: lidars 'front' and 'rear': by the surfaces around" in found.sentence
     assert "'rear' are 1.50 +- 0.22 ms earlier than those of 'front' (7 sigma)" in found.sentence
+    assert "whose mount moved during the drive may look like this" in found.sentence
     (later,) = clock_findings(["drive"], [apart(rear=1.0)], calm)
     assert "ms later than" in later.sentence
     assert clock_findings(["drive"], [apart(rear=0.8)], calm) == ()

@@ -132,7 +132,9 @@ def apart_finding(
         f"'{second}' are {1e3 * abs(apart_s):.2f} +- {1e3 * sigma_s:.2f} ms {way} than those of "
         f"'{first}' ({sigmas:.0f} sigma), and S2S may be off by how far the vehicle moves "
         "meanwhile. Synchronise their clocks, or set solve.time_offset; clouds of a whole sweep "
-        "without a time per point look the same, and no offset mends them",
+        "without a time per point look the same, and no offset mends them. A LiDAR whose mount "
+        "moved during the drive may look like this, too: 'caliv-graph validate' then contradicts "
+        "the result on held-out structure",
     )
 
 

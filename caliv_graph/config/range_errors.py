@@ -177,13 +177,26 @@ def size_weights(
     """
     if len(priors) == 1:
         return _weights(_costs(information, pull, priors[0].sigmas) + priors[0].cost)
-    sizes = np.stack(np.meshgrid(*(prior.sigmas for prior in priors), indexing="ij"), axis=-1)
-    cost = np.zeros(sizes.shape[:-1])
+    # The kind with the most errors is integrated out on its own axes, at each of its sizes. What
+    # is left is small.
+    most = int(np.argmax(np.bincount(kinds, minlength=len(priors))))
+    rest = [k for k in range(len(priors)) if k != most]
+    grids = np.meshgrid(*(priors[k].sigmas for k in rest), indexing="ij")
+    few, many = np.flatnonzero(kinds != most), np.flatnonzero(kinds == most)
+    sizes = np.stack(grids, axis=-1)[..., np.searchsorted(rest, kinds[few])]
+    values, axes = np.linalg.eigh(information[np.ix_(many, many)])
+    values = np.maximum(values, 0.0)
+    common, pulled = axes.T @ information[np.ix_(many, few)], axes.T @ pull[many]
+    costs = []
+    for sigma in priors[most].sigmas.tolist():
+        known = 1.0 + sigma**2 * values
+        lost = sigma**2 / known
+        left = information[np.ix_(few, few)] - common.T @ (lost[:, None] * common)
+        alone = 0.5 * (np.log(known) - lost * pulled**2).sum()
+        costs.append(alone + _costs_of(left, pull[few] - common.T @ (lost * pulled), sizes))
+    cost = np.moveaxis(np.array(costs), 0, most)
     for k, prior in enumerate(priors):
         cost += prior.cost.reshape([-1 if axis == k else 1 for axis in range(len(priors))])
-    # One size of the first kind at a time: temporary memory is small.
-    for of_first, some in zip(cost, sizes, strict=True):
-        of_first += _costs_of(information, pull, some[..., kinds])
     return _weights(cost)
 
 

@@ -16,6 +16,10 @@ def without_errors(
     `directions` (n, k); `pull` (k,) is the gradient in e; None: that at no errors.
     """
     seen = H @ directions
-    factor = scipy.linalg.cho_factor(np.eye(directions.shape[1]) + directions.T @ seen, lower=True)
-    pulled = scipy.linalg.cho_solve(factor, directions.T @ gradient if pull is None else pull)
-    return H - seen @ scipy.linalg.cho_solve(factor, seen.T), gradient - seen @ pulled
+    known = np.eye(directions.shape[1]) + directions.T @ seen
+    root = scipy.linalg.cholesky(known, lower=True)
+    taken = scipy.linalg.solve_triangular(root, seen.T, lower=True)
+    pull = directions.T @ gradient if pull is None else pull
+    pulled = scipy.linalg.solve_triangular(root, pull, lower=True)
+    # A matrix by its own transpose is half the work.
+    return H - taken.T @ taken, gradient - taken.T @ pulled

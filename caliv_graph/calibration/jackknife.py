@@ -19,9 +19,9 @@ from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes, stack
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.registration.moments import Responsibilities
-from caliv_graph.registration.register import JointRegistration
+from caliv_graph.registration.register import TRUSTED_WEIGHT, JointRegistration
 
 GROUPS = 4
 """Parts of the clouds that are left out in turn: three degrees of freedom for each of twelve
@@ -64,13 +64,14 @@ def jackknife_scale(
         states: the registration of each placement at the solution; they stay as they are.
         lines: predicted poses of the clouds there.
     """
-    if not _tell(problem):
+    trusted = np.concatenate([state.weights > TRUSTED_WEIGHT for state in states])
+    if not _tell(problem, trusted):
         return 1.0
     # Where the data tell nothing, wide guesses would let the parts wander off along what they do
     # not determine, and the way is curved.
     usual = np.tile(DEFAULT_GUESS_SIGMAS**-2.0, len(problem.lidars))
     prior = np.maximum(problem.guess_information(), np.diag(usual))
-    parts = _parts(problem, states, lines)
+    parts = _parts(problem, states, lines, trusted)
     every = _placements(problem, extrinsics, states, lines, parts)
     H, _ = _system(every, extrinsics)
     known = np.linalg.solve(H + prior, H)
@@ -102,32 +103,36 @@ def _stays_below_one(scales: Sequence[float]) -> bool:
     return scales[-1] + left * max(scales[-1] - scales[-2], 0.0) < 1.0
 
 
-def _distinct_views(problem: Problem) -> Array:
-    """(n,) different views of each LiDAR: scans of one view count as one."""
-    each = 1.0 / problem.all_views()
+def _distinct_views(problem: Problem, trusted: BoolArray) -> Array:
+    """(n,) different views of each LiDAR: scans of one view count as one.
+
+    Clouds (J,) that are not `trusted` are none: without one of them nothing changes.
+    """
+    each = trusted / problem.all_views()
     distinct = np.bincount(problem.cloud_lidar, each, minlength=len(problem.lidars))
     return np.asarray(np.round(distinct, 6))  # three thirds are one
 
 
-def _tell(problem: Problem) -> bool:
+def _tell(problem: Problem, trusted: BoolArray) -> bool:
     """Whether every LiDAR with clouds has enough of different views for a jackknife."""
-    distinct = _distinct_views(problem)
-    count = np.bincount(problem.cloud_lidar, minlength=len(problem.lidars))
+    distinct = _distinct_views(problem, trusted)
+    count = np.bincount(problem.cloud_lidar, trusted, minlength=len(problem.lidars))
     few = (distinct >= LEAST_LIDAR_CLOUDS) & (count <= SCANS_OF_A_VIEW * distinct)
     return bool(((distinct >= MANY_VIEWS) | few)[count > 0].all())
 
 
-def _groups(problem: Problem) -> IntArray:
+def _groups(problem: Problem, trusted: BoolArray) -> IntArray:
     """(J,) part that each cloud belongs to: runs of `TOGETHER` clouds of a LiDAR, in turn.
 
-    From placement to placement the turn goes on.
+    From placement to placement the turn goes on. Clouds that are not `trusted` are in the first.
     """
     out = np.zeros(problem.clouds, dtype=np.int64)
-    in_a_row = np.where(_distinct_views(problem) < MANY_VIEWS, 1, TOGETHER)
+    in_a_row = np.where(_distinct_views(problem, trusted) < MANY_VIEWS, 1, TOGETHER)
     for a, together in enumerate(in_a_row.tolist()):
         runs = 0
         for m in range(problem.placements):
-            own = np.flatnonzero((problem.cloud_lidar == a) & (problem.cloud_placement == m))
+            of_lidar = trusted & (problem.cloud_lidar == a)
+            own = np.flatnonzero(of_lidar & (problem.cloud_placement == m))
             own = own[np.argsort(problem.cloud_pose[own], kind="stable")]
             number = runs + np.arange(len(own)) // together
             out[own] = number % GROUPS
@@ -151,10 +156,13 @@ class _Part:
 
 
 def _parts(
-    problem: Problem, states: Sequence[JointRegistration], lines: CloudLinearisation
+    problem: Problem,
+    states: Sequence[JointRegistration],
+    lines: CloudLinearisation,
+    trusted: BoolArray,
 ) -> list[list[_Part]]:
     """The parts of every placement, without those that are empty."""
-    group = _groups(problem)
+    group = _groups(problem, trusted)
     out = []
     for own, state in zip(problem.clouds_of_placements(), states, strict=True):
         R, t = stack(lines.predicted[own])

@@ -24,6 +24,7 @@ from caliv_graph.calibration.jackknife import (
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.conventions import key_extrinsic, key_pose_error, key_target, key_vehicle
+from caliv_graph.products import BoolArray
 from caliv_graph.registration.register import JointRegistration
 from tests.calibration.problems import PERIOD_NS, SIGMAS, make_case, with_clouds
 from tests.registration.scenes import chair_scene, config_of, matrices
@@ -31,12 +32,18 @@ from tests.samples import pose
 
 CLOUDS = 32
 
+
+def every(problem: Problem) -> BoolArray:
+    """All clouds are trusted."""
+    return np.ones(problem.clouds, dtype=bool)
+
+
 # ------------------------------------------------------------------ what is left out
 
 
 def test_neighbouring_clouds_of_a_lidar_are_left_out_together() -> None:
     problem = make_case("front", "rear", count=24, drives=2).problem
-    group = _groups(problem)
+    group = _groups(problem, every(problem))
     assert set(group.tolist()) == set(range(GROUPS))
     for lidar in range(2):
         for placement in range(2):
@@ -53,7 +60,7 @@ def test_clouds_of_a_lidar_with_few_are_left_out_one_by_one() -> None:
     problem = make_case("front", "rear", count=24).problem
     kept = (problem.cloud_lidar == 0) | (problem.cloud_pose % 2 == 0)
     some = with_clouds(problem, kept)
-    group = _groups(some)
+    group = _groups(some, every(some))
     for lidar, in_a_row in ((0, TOGETHER), (1, 1)):
         own = np.flatnonzero(some.cloud_lidar == lidar)
         own = own[np.argsort(some.cloud_pose[own])]
@@ -64,14 +71,16 @@ def test_clouds_are_grouped_in_the_order_of_time() -> None:
     problem = make_case("front", count=24).problem
     order = np.random.default_rng(3).permutation(24)
     mixed = with_clouds(problem, order)
-    np.testing.assert_array_equal(_groups(mixed), _groups(problem)[order])
+    np.testing.assert_array_equal(
+        _groups(mixed, every(mixed)), _groups(problem, every(problem))[order]
+    )
 
 
 def test_few_clouds_of_several_placements_are_spread_over_the_parts() -> None:
     problem = make_case("front", count=8).problem
     for placements in (2, 4, 8):
         several = replace(problem, cloud_placement=np.arange(8) % placements, placements=placements)
-        assert np.bincount(_groups(several)).tolist() == [2] * GROUPS
+        assert np.bincount(_groups(several, every(several))).tolist() == [2] * GROUPS
 
 
 # ------------------------------------------------------------------ a chair
@@ -186,7 +195,7 @@ def test_few_views_of_many_scans_tell_nothing() -> None:
         cloud_placement=np.zeros(72, np.int64),
         views=np.full(72, 3.0),
     )
-    assert _tell(thirds)
+    assert _tell(thirds, every(thirds))
 
 
 def test_clouds_that_are_left_out_have_no_part() -> None:
@@ -216,7 +225,7 @@ def test_a_placement_may_lose_all_its_clouds() -> None:
     states = [chair.state, chair.state.only(np.array([0, 1]))]
     predicted = (*chair.lines.predicted, *chair.lines.predicted[:2])
     lines = replace(chair.lines, predicted=predicted)
-    assert _groups(problem)[-2:].tolist() == [0, 0]
+    assert _groups(problem, every(problem))[-2:].tolist() == [0, 0]
     scale = jackknife_scale(problem, [chair.extrinsic], states, lines)
     assert scale == pytest.approx(chair.scale(), rel=0.2)
 
@@ -226,6 +235,17 @@ def test_few_clouds_tell_it_too_but_not_very_few() -> None:
     few = 12
     assert seen_chair(few, shared_m=0.02).scale() > 1.5 * seen_chair(few).scale()
     assert seen_chair(LEAST_LIDAR_CLOUDS - 1, shared_m=0.02).scale() == 1.0
+
+
+def test_clouds_that_are_not_trusted_are_no_clouds() -> None:
+    """Without one of them nothing changes: a part of them alone says that nothing does."""
+    chair = seen_chair()
+    trusted = np.arange(CLOUDS) % 4 != 1  # all of a part, if they were put in turn
+    group = _groups(chair.problem, trusted)
+    assert np.bincount(group[trusted]).tolist() == [CLOUDS * 3 // 4 // GROUPS] * GROUPS
+    few = copy(chair.state)
+    few.weights = np.where(np.arange(CLOUDS) < LEAST_LIDAR_CLOUDS - 1, 1.0, 0.0)
+    assert jackknife_scale(chair.problem, [chair.extrinsic], [few], chair.lines) == 1.0
 
 
 def test_information_along_a_motion_is_that_of_the_joint_quadratic() -> None:

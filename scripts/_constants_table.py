@@ -429,17 +429,10 @@ CONSTANTS: tuple[Constant, ...] = (
     # ---- the joint loop and its verdicts
     Constant(
         _REFINE,
-        "SHAPES_BEGUN_AGAIN",
-        "",
-        "iteration after which normals and mixture begin anew",
-        "annealing from 20 mm to 6 mm by 0.85 takes ceil(7.4) = 8 iterations",
-    ),
-    Constant(
-        _REFINE,
         "DECIDED_AFTER",
         "",
         "iteration after which the number of undetermined directions is kept",
-        "one after the shapes begin anew; against jumps without end",
+        "annealing ends before; against jumps without end",
         (("s_curve", 2), ("arc", 2)),
     ),
     Constant(

@@ -69,7 +69,12 @@ from caliv_graph.registration.quadratic import (
     ShapeQuadratic,
     shape_quadratic,
 )
-from caliv_graph.registration.register import ANNEALING, FINE_SIGMA_M, FLOOR_PER_RANGE_SIGMA
+from caliv_graph.registration.register import (
+    ANNEALING,
+    FINE_SIGMA_M,
+    FLOOR_PER_RANGE_SIGMA,
+    TILES_SETTLE,
+)
 from caliv_graph.registration.surfels import STEEP
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.scenario.model import Scenario, load_scenario
@@ -84,7 +89,7 @@ GAMMA = 0.05
 """`registration.outlier_ratio`, as the config has it."""
 
 MIN_POINTS = 50
-ITERATIONS, SHAPES_BEGUN_AGAIN = 24, 8
+ITERATIONS = 24
 START_SIGMAS = np.array([1e-3] * 3 + [5e-3] * 3)
 """Of what the iteration starts from: a little more than the registration is known to."""
 
@@ -259,7 +264,7 @@ class Estimator:
         self.clouds, self.truth = clouds, truth
         self._components = components
         self._floor_end = FLOOR_PER_RANGE_SIGMA * clouds.sigma_range_m
-        self._floor = FINE_SIGMA_M
+        self._floor, self._by_beams_for = FINE_SIGMA_M, 0
         self._stack = clouds.stack
         self._depth_m = 1.0
         self._noise = self._configured = HeightNoise.configured(
@@ -297,11 +302,16 @@ class Estimator:
         points = self._stack.moved(R, t)
         low, high = np.percentile(points, [1, 99], axis=0)
         self._depth_m = float(np.linalg.norm(np.maximum(high - low, 0.05)))
-        self._floor = FINE_SIGMA_M
+        self._floor, self._by_beams_for = FINE_SIGMA_M, 0
         distinct = float((self._stack.sizes / self.clouds.views).sum())
         return seed_mixture(
             self._stack, R, t, self._components, FINE_SIGMA_M, distinct, everywhere=True
         )
+
+    @property
+    def _settled(self) -> bool:
+        """Whether tiles and noise stay, as in the joint loop."""
+        return self._by_beams_for > TILES_SETTLE
 
     def at(self, T: Sequence[gtsam.Pose3], mixture: Mixture) -> Equation:
         """E-step; at the end of annealing the noise of the heights as well."""
@@ -310,10 +320,11 @@ class Estimator:
         density = GAMMA / (self._depth_m * (GAMMA + 1.0))
         noise = replace(self._noise, floor_m=self._floor)
         finest = self._floor <= self._floor_end
+        self._by_beams_for += int(finest)
         who = expect(self._stack, R, t, mixture, noise, density, self.weights, by_beams=finest)
         cells = cell_moments(self._stack, who, len(mixture.weights))
         quadratic = shape_quadratic(self._stack, R, t, mixture, cells, who)
-        if finest:
+        if finest and not self._settled:
             taken_up = quadratic.shape_parameters()
             self._noise = noise.fitted(who.heights, taken_up, self._configured)
             self._shared = self._noise.shared_part(who.heights)
@@ -323,19 +334,19 @@ class Estimator:
         """M-step of the shape."""
         R, t, _ = self.poses(T)
         sums = equation.cells, equation.who.counts, equation.quadratic.turns
-        return maximise_shape(self._stack, R, t, mixture, self._floor, *sums)
+        return maximise_shape(
+            self._stack, R, t, mixture, self._floor, *sums, tiles_held=self._settled
+        )
 
     def solve(self, T: list[gtsam.Pose3]) -> tuple[list[gtsam.Pose3], Mixture, Equation]:
         """Iterates from T."""
         mixture = self.begin(T)
-        for number in range(1, ITERATIONS + 1):
+        for _ in range(ITERATIONS):
             equation = self.at(T, mixture)
             pull = -equation.score - self._prior @ self.error(T)
             step = np.asarray(np.linalg.solve(equation.sensitivity + self._prior, pull), np.float64)
             T = [retract_vehicle_axes(p, d) for p, d in zip(T, step.reshape(-1, 6), strict=True)]
             mixture = self.shape(T, mixture, equation)
-            if number == SHAPES_BEGUN_AGAIN:
-                mixture = self.begin(T)
         return T, mixture, self.at(T, mixture)
 
     def error(self, T: Sequence[gtsam.Pose3]) -> Array:

@@ -482,30 +482,16 @@ def test_the_reference_does_not_matter(sparse: Tried) -> None:
     assert widened(sparse, other) < 0.1
 
 
-def test_an_unsteady_end_is_the_mean_of_several(
-    sparse: Tried, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ends: list[list[gtsam.Pose3]] = []
-    mean_of = refine._Loop.move_to_mean
+def test_the_joint_loop_has_one_end(sparse: Tried, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Tiles of the surface that wander took the extrinsics along by 0.3 to 0.5 sigmas, for ever.
+    monkeypatch.setattr(refine, "STEP_TOLERANCE", (0.0, 0.0))
+    monkeypatch.setattr(refine, "STEP_SIGMAS", 0.05)
+    further = try_out(sparse.drive)
 
-    def kept(loop: refine._Loop, of: Sequence[Sequence[gtsam.Pose3]]) -> None:
-        ends.extend([*one] for one in of)
-        mean_of(loop, of)
-
-    monkeypatch.setattr(refine._Loop, "move_to_mean", kept)
-    monkeypatch.setattr(refine, "UNSTEADY_SIGMAS", 0.0)
-    several = try_out(sparse.drive)
-
-    assert len(ends) == 1 + refine.OTHER_STARTS
-    further = refine.further_refinements(sparse.drive.config.noise.lidar_range_m)
-    first = len(several.run.solution.course) - refine.OTHER_STARTS * further
-    assert 0 < first <= refine.REFINEMENTS
-    # Each is another, all are of the same data, and the result is where their mean is.
-    for i, name in enumerate(several.poses):
-        steps = [vehicle_axes_difference(end[i], several.poses[name]) for end in ends]
-        assert np.abs(steps).max() > 1e-6
-        assert np.mean(steps, axis=0) == pytest.approx(np.zeros(6), abs=1e-6)
-    assert apart(sparse, several) < 1.0
+    course = further.run.solution.course
+    assert len(sparse.run.solution.course) < len(course) < refine.REFINEMENTS
+    assert course[-1].sigmas < 0.05
+    assert apart(sparse, further) < 0.3
 
 
 # ------------------------------------------------------------------ outliers

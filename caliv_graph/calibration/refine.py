@@ -43,7 +43,7 @@ from caliv_graph.calibration.solve import (
     step_of_mode,
 )
 from caliv_graph.config.range_errors import range_errors
-from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
+from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, Iteration, Registration, Solution
 from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import (
@@ -55,13 +55,9 @@ from caliv_graph.registration.register import (
 from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry, refit
 from caliv_graph.uncertainty.consistency import RANGE_BIAS_LIMIT_M
 
-SHAPES_BEGUN_AGAIN = 8
-"""Iteration of the joint loop after which normals and mixture are made anew: annealing is at its
-end, or near it."""
-
 REFINEMENTS = 30
 """Iterations of the joint loop at most; more where the noise is so small that annealing to it takes
-more. Most drives take 12 to 18; two of 30 mm of noise and 30 clouds took 23 and 24."""
+more."""
 
 HELD_PART = 1e-6
 """Ridge, relative to each cloud's own information, on the poses that minimise the clouds'
@@ -86,24 +82,10 @@ STEP_SIGMAS = 0.1
 """Largest step of the extrinsics, rad and m, at which the joint loop has converged: a fraction of
 the accuracy of 100 clouds of a chair. Or else in joint standard deviations of the extrinsics."""
 
-UNSTEADY_SIGMAS = 0.2
-"""Last step, in joint standard deviations of the extrinsics, from which the end is one of many:
-where clouds are sparse the nearest surfels of points change for ever, and another start of the
-shapes ends elsewhere, by 0.2 to 1 standard deviation of S2S (dense clouds: 0.1)."""
-
-OTHER_STARTS = 2
-"""Then the shapes begin so many times more, on other points, and the mean of all ends is taken."""
-
 
 def refinements(sigma_range_m: float) -> int:
-    """How many iterations a start may take, at this noise along the beam (metres)."""
-    annealed = SHAPES_BEGUN_AGAIN + annealing_steps(FINE_SIGMA_M, sigma_range_m)
-    return max(REFINEMENTS, annealed + LAST_REFINEMENTS)
-
-
-def further_refinements(sigma_range_m: float) -> int:
-    """How many iterations each other start takes, at this noise along the beam (metres)."""
-    return annealing_steps(FINE_SIGMA_M, sigma_range_m) + LAST_REFINEMENTS
+    """How many iterations there may be, at this noise along the beam (metres)."""
+    return max(REFINEMENTS, annealing_steps(FINE_SIGMA_M, sigma_range_m) + LAST_REFINEMENTS)
 
 
 def refined(
@@ -112,7 +94,7 @@ def refined(
     most: int,
     advance: Callable[..., None],
 ) -> Solution:
-    """Expectation-maximisation whose M-step is the graph solve, `most` iterations per start.
+    """Expectation-maximisation whose M-step is the graph solve, `most` iterations.
 
     `state` (of `solve_registered`) and `states`, the registration of each placement, are taken
     along; `advance` is called after each iteration.
@@ -142,7 +124,7 @@ def registered_with_motion(
         state: of `solve_registered`; gets values, weights, the scale of the registration, and what
             biases of the ranges do to the poses.
         states: the registration of each placement, taken along.
-        most: iterations per start.
+        most: iterations.
         advance: is called after each.
 
     Raises:
@@ -204,23 +186,13 @@ def _settled(
     sizes = channel_sizes(channels.lidars, found, range_errors(state.config.noise))
     base, prior = base_graph(state), state.problem.guess_information()
     loop = _Loop(state, states, base, prior, none_m, channels, sizes)
-    loop.begin_shapes(normals=False)
+    loop.begin_shapes()
     course: list[Iteration] = []
     converged = False
     while len(course) < most and not converged:
         course.append(loop.iterate(len(course) + 1))
         converged = loop.has_converged(course[-1])
         advance()
-    if course[-1].sigmas > UNSTEADY_SIGMAS:
-        ends = [loop.extrinsics()]
-        further = further_refinements(state.config.noise.lidar_range_m)
-        for draw in range(1, OTHER_STARTS + 1):
-            loop.begin_shapes(normals=False, draw=draw)
-            for _ in range(further):
-                course.append(loop.iterate(len(course) + 1))
-                advance()
-            ends.append(loop.extrinsics())
-        loop.move_to_mean(ends)
     return loop, course, converged
 
 
@@ -269,27 +241,17 @@ class _Loop:
         """T_vehicle_lidar of every LiDAR."""
         return list(self.state.problem.extrinsics(self.state.values).values())
 
-    def move_to_mean(self, ends: Sequence[Sequence[gtsam.Pose3]]) -> None:
-        """Takes the extrinsics to the mean of these, the last of which they are; all else follows.
+    def begin_shapes(self) -> None:
+        """New normals and a new mixture, at the poses of the solved graph: EM ends near its start.
 
-        The ends are a fraction of a sigma apart: the mean of their tangents is the mean.
+        The surfels are those of beams from now on.
         """
-        now = self.extrinsics()
-        steps = [
-            np.concatenate([vehicle_axes_difference(T, T0) for T, T0 in zip(end, now, strict=True)])
-            for end in ends
-        ]
-        self.state.values = self.linearised(*self.expected()).move(np.mean(steps, axis=0))
-
-    def begin_shapes(self, normals: bool, draw: int = 0) -> None:
-        """A new mixture, and if asked for new normals, at these: EM ends near its start."""
         _hand_weights(self.state, self.states)
         lines = linearise_clouds(self.state.problem, self.state.values)
         for shape, (R, t) in zip(self.states, self.poses_of_clouds(lines), strict=True):
-            if normals:
-                shape.refine_normals(R, t)
+            shape.refine_normals(R, t)
             shape.by_beams, shape.held_along = True, 0.0
-            shape.seed(R, t, FINE_SIGMA_M, draw)
+            shape.seed(R, t, FINE_SIGMA_M)
         self.ranges = tuple(OwnRanges.of(shape.clouds) for shape in self.states)
 
     def left_out(self, lines: CloudLinearisation) -> float:
@@ -375,8 +337,6 @@ class _Loop:
         for shape, (R, t) in zip(self.states, self.poses_of_clouds(new), strict=True):
             shape.maximise(R, t)
         change = self._weigh(squared)
-        if number == SHAPES_BEGUN_AGAIN:
-            self.begin_shapes(normals=True)
         size = np.abs(step.reshape(-1, 6))
         sigmas = float(np.sqrt(step @ (reduced.D + self.prior) @ step))
         return Iteration(float(size[:, :3].max()), float(size[:, 3:].max()), sigmas, change, lost)

@@ -61,7 +61,6 @@ def seed_mixture(
     distinct: float | None = None,
     trusted: BoolArray | None = None,
     everywhere: bool = False,
-    draw: int = 0,
 ) -> Mixture:
     """The initial mixture of width `sigma_m`: components on points with reliable normals.
 
@@ -70,8 +69,7 @@ def seed_mixture(
     translations t (J, 3). There are fewer `components` if few points are `distinct`
     (`POINTS_PER_COMPONENT`): those of scans of one view count as one. None: all are. Clouds (J,)
     that are not `trusted` get no surfels: a cloud in the wrong place would explain itself.
-    `everywhere`: on points whose normals are not reliable as well, as on thin parts. Each `draw`
-    takes others, as far as there are some.
+    `everywhere`: on points whose normals are not reliable as well, as on thin parts.
     """
     distinct = len(stack.points) if distinct is None else distinct
     points = stack.moved(R, t)
@@ -88,7 +86,7 @@ def seed_mixture(
     starts = np.searchsorted(cloud[by_cloud], cloud[by_cloud], side="left")
     rank = np.empty(len(order), dtype=np.int64)
     rank[by_cloud] = np.arange(len(order)) - starts
-    chosen = np.roll(order[np.argsort(rank, kind="stable")], -draw * components)[:components]
+    chosen = order[np.argsort(rank, kind="stable")][:components]
     count = len(chosen)
     return Mixture(
         means_target=points[chosen].copy(),
@@ -249,6 +247,7 @@ def maximise_shape(
     cells: Array,
     counts: Array,
     turns: Array,
+    tiles_held: bool = False,
 ) -> Mixture:
     """M-step of the surfels at new poses: means, normals, widths, share of the points.
 
@@ -261,10 +260,16 @@ def maximise_shape(
         cells: `cell_moments` of its responsibilities.
         counts: (K,) points of each surfel.
         turns: (K, 3) rotation of each normal, of the quadratic of the E-step.
+        tiles_held: surfels keep their widths, and move along their normals only.
     """
     carry = to_target(stack, R, t)
     mass, means = mass_and_means(np.matmul(cells[..., MOMENTS], carry).sum(axis=0), mixture)
     normals = _turned(mixture.normals_target, turns)
+    share = counts / max(float(counts.sum()), 1e-300)
+    if tiles_held:
+        across = np.einsum("ka,ka->k", means - mixture.means_target, normals)
+        places = mixture.means_target + across[:, None] * normals
+        return Mixture(places, normals, mixture.var_tangent, share)
     # Across the surface a surfel lies where the points are; along it, where their beams meet it.
     on_surface = np.matmul(cells[..., SURFACE_MOMENTS], carry).sum(axis=0)
     centres = mass_and_means(on_surface, mixture)[1]
@@ -278,7 +283,7 @@ def maximise_shape(
         means_target=centres,
         normals_target=normals,
         var_tangent=np.maximum(aside2 / (2.0 * mass), floor),
-        weights=counts / max(float(counts.sum()), 1e-300),
+        weights=share,
     )
 
 

@@ -63,6 +63,12 @@ NEIGHBOURS_HELD = 4
 one to the next surfels and clouds move by a millimetre, a twentieth of what surfels are apart; the
 search takes half of an E-step."""
 
+TILES_SETTLE = 3
+"""Iterations by beams after which the surfels stay where they are along the surface, and the noise
+of the heights is what it is. A surface looks the same wherever it is cut into tiles; left free the
+tiles wander over it for hundreds of iterations, and take the poses along by 0.3 standard
+deviations."""
+
 LEFT_OUT = 1e-9
 """Weight of a cloud that shall neither shape the target nor move."""
 
@@ -165,6 +171,7 @@ class JointRegistration:
         self.weights: Array = np.ones(self.clouds.count)
         self.held_along = HELD_ALONG_M**-2.0
         self.by_beams = False
+        self._by_beams_for = 0
 
     def refine_normals(self, R: Array, t: Array) -> None:
         """Estimates surface normals again, from the clouds of each LiDAR merged at (R, t)."""
@@ -197,13 +204,11 @@ class JointRegistration:
             part._near = self._near[self.clouds.points_of(which)]
         return part
 
-    def seed(self, R: Array, t: Array, sigma_m: float, draw: int = 0) -> None:
-        """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t).
-
-        Another `draw` begins on other points.
-        """
+    def seed(self, R: Array, t: Array, sigma_m: float) -> None:
+        """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t)."""
         self._depth_m = depth_of(self.clouds.moved(R, t))
         self._near = None
+        self._by_beams_for = 0
         self._floor = max(sigma_m, self._floor_end)
         distinct = float((self.clouds.sizes * self.view_weights).sum())
         trusted = self.weights > TRUSTED_WEIGHT
@@ -216,7 +221,6 @@ class JointRegistration:
             distinct,
             trusted if trusted.sum() >= 2 else None,
             self.by_beams,
-            draw,
         )
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:
@@ -243,13 +247,18 @@ class JointRegistration:
         self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
-        if self.finest:
+        if self.finest and not self._settled:
             taken_up = quadratic.shape_parameters()
             self.noise = self._noise_now().fitted(who.heights, taken_up, self._configured)
             self._shared = self.noise.shared_part(who.heights)
         # Not the quadratic itself: it is as large as all the rest.
         self._expected = cells, who.counts, quadratic.turns
         return quadratic
+
+    @property
+    def _settled(self) -> bool:
+        """Whether tiles and noise are what they are (`TILES_SETTLE`)."""
+        return self._by_beams_for >= TILES_SETTLE
 
     def _noise_now(self) -> HeightNoise:
         """The noise of the heights, annealed."""
@@ -259,9 +268,12 @@ class JointRegistration:
         """M-step of the components at the new `T_target_lidar` (R, t)."""
         if self._expected is None:
             raise RegistrationError(f"{self.observation.name}: E-step missing")
+        mixture, held = self.mixture, self._settled
         self._mixture = maximise_shape(
-            self.clouds, R, t, self.mixture, self._floor, *self._expected
+            self.clouds, R, t, mixture, self._floor, *self._expected, tiles_held=held
         )
+        if self.by_beams and self.finest:
+            self._by_beams_for += 1
         self._expected = None  # as large as all the rest
 
     def result(

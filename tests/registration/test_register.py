@@ -25,6 +25,7 @@ from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
 from caliv_graph.registration.register import (
     MAX_STEP,
     NEIGHBOURS_HELD,
+    TILES_SETTLE,
     JointRegistration,
     annealing_steps,
     free_step,
@@ -540,6 +541,38 @@ def test_the_noise_of_the_heights_is_estimated_at_the_end_of_annealing() -> None
         state.expect(R, t)
         state.maximise(R, t)
     assert math.sqrt(state.noise.range_m2[0]) == pytest.approx(SIGMA_M, rel=0.25)
+
+
+def test_tiles_and_noise_stay_once_beams_have_told_them_for_a_while() -> None:
+    state = JointRegistration(observe(clouds_of(chair())), config_of(lidar_range_m=0.005))
+    R, t = matrices(chair().T_target_lidar)
+    state.by_beams, state.held_along = True, 0.0
+
+    def iterated() -> tuple[Mixture, Mixture]:
+        before = state.mixture
+        state.expect(R, t)
+        state.maximise(R, t)
+        return before, state.mixture
+
+    def slid_m(before: Mixture, after: Mixture) -> float:
+        moved = np.cross(after.means_target - before.means_target, after.normals_target)
+        return float(np.linalg.norm(moved, axis=1).max())
+
+    for _ in range(2):  # a new mixture begins as free as the first
+        state.seed(R, t, 0.02)
+        while not state.finest:
+            iterated()
+        for _ in range(TILES_SETTLE - 1):  # the last of annealing was by beams, too
+            assert slid_m(*iterated()) > 1e-4
+        noise, widths = state.noise, state.mixture.var_tangent
+        heights = []
+        for _ in range(2):
+            before, after = iterated()
+            assert slid_m(before, after) < 1e-12
+            heights.append(np.abs(after.means_target - before.means_target).max())
+        assert state.noise is noise
+        assert state.mixture.var_tangent is widths
+        assert min(heights) > 1e-6
 
 
 def test_surfels_near_the_beams_are_searched_for_at_times(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ from caliv_graph.pipeline import calibrate
 from caliv_graph.products import Recording
 
 PERIOD_S = 0.004
-"""Processor time from one sample to the next: a run of 10 s has 2,500 samples."""
+"""Processor time from one sample to the next: a run of 10 s has up to 2,500 samples."""
 
 SHOWN = 30
 """Functions in the text, of each list."""
@@ -34,29 +34,35 @@ PACKAGE = f"{Path(caliv_graph.__file__).parent}/"
 
 @dataclass
 class Samples:
-    """Samples by function, `room/file.py:name`.
+    """Processor time by function, `room/file.py:name`, in seconds.
+
+    A sample counts with the time since the one before: the timer is answered between two
+    instructions of Python, so that a long call of compiled code has one sample.
 
     Attributes:
-        number: all samples.
+        until_s: processor time of the last sample.
         own: in the function itself, and in what it calls outside the package.
         total: in the function, and in all that it calls.
     """
 
-    number: int = 0
-    own: Counter[str] = field(default_factory=Counter)
-    total: Counter[str] = field(default_factory=Counter)
+    until_s: float = field(default_factory=time.process_time)
+    own: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    total: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
 
     def take(self, frame: FrameType | None) -> None:
-        """Counts one sample by the frames from the innermost."""
-        self.number += 1
+        """Adds the time since the last sample, by the frames from the innermost."""
+        now_s = time.process_time()
+        spent_s, self.until_s = now_s - self.until_s, now_s
         names = []
         while frame is not None:
             code = frame.f_code
             if code.co_filename.startswith(PACKAGE):
                 names.append(f"{code.co_filename.removeprefix(PACKAGE)}:{code.co_qualname}")
             frame = frame.f_back
-        self.own.update(names[:1])
-        self.total.update(set(names))
+        for name in names[:1]:
+            self.own[name] += spent_s
+        for name in set(names):
+            self.total[name] += spent_s
 
 
 @contextmanager
@@ -104,10 +110,9 @@ def profiled(name: str, recording: Recording, config: Config) -> Profile:
     cpu_s = time.process_time() - begun
     stages = [(s.name, s.cpu_seconds or 0.0) for s in progress.stages if s.depth == 0]
     stages.append(("between the stages, tests", cpu_s - sum(seconds for _, seconds in stages)))
-    each_s = cpu_s / max(samples.number, 1)
     own, total = (
-        {function: each_s * count for function, count in counted.most_common()}
-        for counted in (samples.own, samples.total)
+        dict(sorted(spent_s.items(), key=lambda of: -of[1]))
+        for spent_s in (samples.own, samples.total)
     )
     return Profile(name, cpu_s, stages, own, total)
 

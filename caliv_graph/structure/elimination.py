@@ -15,9 +15,9 @@ import scipy.linalg
 import scipy.sparse
 
 from caliv_graph.common.cores import share_out, shared_map
-from caliv_graph.common.memory import give_back_freed_arrays
 from caliv_graph.errors import SolveError
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.sparse_parts import entries
 
 RIDGES = (1e-12, 1e-11, 1e-10)
 """Relative ridges under which a system is solved, the first that rounding leaves positive: poses
@@ -90,34 +90,32 @@ class Surfaces:
 
 
 def eliminated(
-    H: scipy.sparse.csr_array,
-    V: scipy.sparse.csr_array,
+    first: Array,
+    others: scipy.sparse.csr_array,
+    V_t: scipy.sparse.csr_array,
     b: Array,
-    rest: int,
     blocks: Sequence[IntArray],
 ) -> tuple[Array, Array, Surfaces]:
-    """The quadratic `H - V V^T` on the first `rest` coordinates, those of each block eliminated.
+    """The quadratic `H - V V^T` on its first R coordinates, those of each block eliminated.
 
     No two blocks are coupled, and no column of V touches two of them.
 
     Args:
-        H: (D, D).
-        V: (D, G), of a few coordinates a column.
+        first: (R, R) of `H - V V^T`; the result takes its memory.
+        others: (D - R, D) rows of H of the other coordinates.
+        V_t: (G, D) V^T, of a few coordinates a row.
         b: (D,).
-        rest: number of coordinates that remain.
-        blocks: the others, block by block.
+        blocks: the other coordinates, block by block.
 
-    It lets go of H and V when it has what it needs of them.
+    It lets go of the sparse matrices when it has what it needs of them.
 
     Raises:
         SolveError: a block is singular.
     """
-    V_rest = V[:rest]
-    out = (H[:rest, :rest] - V_rest @ V_rest.T).toarray()
-    give_back_freed_arrays()  # of the products of sparse matrices
+    rest, out = len(first), first
     order = np.concatenate(blocks) if len(blocks) else np.zeros(0, dtype=np.int64)
-    rows, V_own, V_columns = H[order], V[order], V_rest.T.tocsr()
-    del H, V, V_rest
+    rows, V_own, V_columns = others[order - rest], V_t.T.tocsr()[order], V_t[:, :rest]
+    del others, V_t, first
     ends = np.cumsum([len(own) for own in blocks])
 
     def factored(k: int) -> _Block:
@@ -129,6 +127,7 @@ def eliminated(
     done = tuple(found[k] for k in range(len(blocks)))
     starts = range(0, rest, PANEL)
     share_out(partial(_subtract_squares, out, done), reversed(starts))
+    _mirror(out)
     right = b[:rest].copy()
     for block in done:
         right[block.others] -= block.coupling.T @ _lower(block.L, b[block.own])
@@ -151,12 +150,12 @@ def _block(
         SolveError: it is singular.
     """
     inside, cross, others, local = _dense_rows(rows, begin, own, rest)
-    row, column, value = _entries(V_own, np.arange(begin, begin + len(own)))
+    row, column, value = entries(V_own, np.arange(begin, begin + len(own)))
     columns, column = np.unique(column, return_inverse=True)
     low = np.zeros((len(own), len(columns)))
     low[row, column] = value
     inside -= low @ low.T
-    row, column, value = _entries(V_columns, columns)
+    row, column, value = entries(V_columns, columns)
     across = np.zeros((len(columns), len(others)))
     across[row, local[column]] = value
     cross -= low @ across
@@ -170,15 +169,22 @@ def _block(
 def _subtract_squares(out: Array, blocks: Sequence[_Block], begin: int) -> None:
     """Subtracts `coupling^T coupling` of each block from `out` (R, R), in place.
 
-    Of the lower half the rows from `begin` on, `PANEL` of them, and the same above the diagonal:
-    whoever does other rows touches nothing of this. The product for all would be as large as `out`.
+    Of the lower half the rows from `begin` on, `PANEL` of them: whoever does other rows touches
+    nothing of this. The product for all would be as large as `out`.
     """
+    flat = out.reshape(-1)
     for block in blocks:
         first, last = np.searchsorted(block.others, [begin, begin + PANEL])
         part = block.coupling[:, first:last].T @ block.coupling[:, :last]
-        some = block.others[first:last]
-        out[np.ix_(some, block.others[:last])] -= part
-        out[np.ix_(block.others[:first], some)] -= part[:, :first].T
+        at = block.others[first:last, None] * len(out) + block.others[:last]
+        np.subtract.at(flat, at.ravel(), part.ravel())
+
+
+def _mirror(out: Array) -> None:
+    """Copies what is below the diagonal of `out` (R, R) to above it."""
+    for begin in range(PANEL, len(out), PANEL):
+        own = slice(begin, begin + PANEL)
+        out[:begin, own] = out[own, :begin].T
 
 
 def _dense_rows(
@@ -189,7 +195,7 @@ def _dense_rows(
     They are those of `rows` from `begin` on. The last one (D,) has the places of `own` and of the
     others in the results.
     """
-    row, column, value = _entries(rows, np.arange(begin, begin + len(own)))
+    row, column, value = entries(rows, np.arange(begin, begin + len(own)))
     across = column < rest
     coupled = np.zeros(rest, dtype=bool)
     coupled[column[across]] = True
@@ -202,17 +208,6 @@ def _dense_rows(
     inside[row[~across], local[column[~across]]] = value[~across]
     cross[row[across], local[column[across]]] = value[across]
     return inside, cross, others, local
-
-
-def _entries(matrix: scipy.sparse.csr_array, rows: IntArray) -> tuple[IntArray, IntArray, Array]:
-    """Row, as a place in `rows`, column and value of all entries of some rows.
-
-    There are hundreds of small blocks: the sparse library's own slices would take longer.
-    """
-    first, count = matrix.indptr[rows], np.diff(matrix.indptr)[rows]
-    before = np.cumsum(count) - count
-    at = np.arange(count.sum()) + np.repeat(first - before, count)
-    return np.repeat(np.arange(len(rows)), count), matrix.indices[at], matrix.data[at]
 
 
 def _lower(L: Array, right: Array, transposed: bool = False) -> Array:

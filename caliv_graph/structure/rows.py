@@ -11,6 +11,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.layout import Layout, Nuisances
 from caliv_graph.structure.residuals import PLANE_ROWS, Geometry, rows_of
 from caliv_graph.structure.sightings import Sightings, without_own_error
+from caliv_graph.structure.sparse_parts import difference_of_squares, members
 
 MOST_NOISE = 0.5
 """Largest part of a strip's information on its tilt that may be noise of the points."""
@@ -42,6 +43,8 @@ class Rows:
         shared: (4 Q, G) derivatives by the offset of each surface in each scan, 1 sigma each.
         of_noise: (D,) what the noise of the points adds to `J^T r` in the mean.
         shared_noise: (G,) the same of `shared^T r`.
+        scan: (Q,) the scan of each sighting.
+        scan_of_group: (G,) the scan of each of the shared offsets.
     """
 
     J: scipy.sparse.csr_array
@@ -49,24 +52,46 @@ class Rows:
     shared: scipy.sparse.csr_array
     of_noise: Array
     shared_noise: Array
+    scan: IntArray
+    scan_of_group: IntArray
 
-    def normal_equations(
-        self,
-    ) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array, Array]:
-        """H and V with H - V V^T of the system, (D, D) and (D, G), and its b (D,).
+    def normal_equations(self, rest: int) -> Quadratic:
+        """The system, the shared offsets eliminated.
 
-        The shared offsets are eliminated; V has their couplings. The product would couple all
-        strips of a surface with each other: most of the memory of the solve.
+        Args:
+            rest: number of coordinates that are not of one surface each, the first ones.
         """
-        B = self.shared
-        J_t = self.J.T.tocsr()
+        J, B = self.J, self.shared
         inner = 1.0 / (1.0 + np.asarray(B.multiply(B).sum(axis=0)).ravel())
         scaled = B.copy()
         scaled.data *= np.sqrt(inner)[B.indices]
-        V = J_t @ scaled
-        b = self.of_noise - J_t @ self.r
-        b += V @ (np.sqrt(inner) * (B.T @ self.r - self.shared_noise))
-        return (J_t @ self.J).tocsr(), V, np.asarray(b)
+        V_t = (scaled.T.tocsr() @ J).tocsr()
+        b = self.of_noise - J.T @ self.r
+        b += V_t.T @ (np.sqrt(inner) * (B.T @ self.r - self.shared_noise))
+        others = (J[:, rest:].T.tocsr() @ J).tocsr()
+        # What two scans have in common are errors of their LiDARs.
+        sightings, groups = members(self.scan), members(self.scan_of_group)
+        rows = {s: (4 * own[:, None] + np.arange(4)).ravel() for s, own in sightings.items()}
+        first = difference_of_squares(J, rows, V_t, groups, rest)
+        return Quadratic(first, others, V_t, np.asarray(b))
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """A quadratic on D coordinates, the first R of which belong to no surface.
+
+    Attributes:
+        first: (R, R) information of the first ones.
+        others: (D - R, D) rows of the others, without `- V V^T`.
+        V_t: (G, D) couplings V^T by shared offsets. The product would couple all strips of a
+            surface with each other: most of the memory of the solve.
+        b: (D,) right-hand side.
+    """
+
+    first: Array
+    others: scipy.sparse.csr_array
+    V_t: scipy.sparse.csr_array
+    b: Array
 
 
 def whitened(
@@ -100,7 +125,7 @@ def whitened(
     q = sightings.count
     J = rows_of(_times(geometry.by, C), geometry.columns, layout.size)
     J.eliminate_zeros()
-    groups, number = np.unique(group, return_inverse=True)
+    groups, first, number = np.unique(group, return_index=True, return_inverse=True)
     by_offset = (nuisances.shared * more)[:, None] * C[:, 3]
     own_group = np.broadcast_to(number.ravel()[:, None], by_offset.shape)
     shared = scipy.sparse.csr_array(
@@ -123,7 +148,8 @@ def whitened(
     of_offset = nuisances.shared * more * of_plane[:, 3]
     of_groups = np.bincount(number.ravel(), of_offset, len(groups))
     r = np.einsum("qi,qij->qj", geometry.plain, C).ravel()
-    return Rows(J, r, shared, np.asarray(of_noise), np.asarray(of_groups))
+    scan = sightings.scan
+    return Rows(J, r, shared, np.asarray(of_noise), np.asarray(of_groups), scan, scan[first])
 
 
 def _times(by: Array, C: Array) -> Array:

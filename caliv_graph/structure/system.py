@@ -43,10 +43,11 @@ def system_of(
     stands: Stands,
 ) -> System:
     """The normal equations of structure, motion data, and how the vehicle stands."""
-    sparse, less, right = rows.normal_equations()
+    rest = layout.plane
+    quadratic = rows.normal_equations(rest)
     del rows  # as large as H
     own_errors = slice(layout.standing, layout.turn)
-    J, r = standing_rows(
+    standing_J, standing_r = standing_rows(
         standing,
         stands,
         state.R_map_vehicle,
@@ -58,9 +59,8 @@ def system_of(
         layout.plane,
         layout.size,
     )
-    sparse, right = sparse + J.T @ J, right - J.T @ r
-    J, r = mean_rows(layout.beams, layout.beam, state.errors)
-    sparse, right = sparse + J.T @ J, right - J.T @ r
+    mean_J, mean_r = mean_rows(layout.beams, layout.beam, state.errors)
+    J = scipy.sparse.vstack([standing_J, mean_J], format="csr")
     weight = np.zeros(layout.size)
     weight[layout.plane : layout.bend] = np.tile(
         [TILT_PRIOR_RAD**-2.0, TILT_PRIOR_RAD**-2.0, PLACE_PRIOR_M**-2.0], layout.strips
@@ -72,12 +72,15 @@ def system_of(
     weight[layout.turn : layout.jitter] = nuisances.turn_rad_s.ravel() ** -2.0
     if nuisances.jitter_s > 0.0:
         weight[layout.jitter : layout.plane] = nuisances.jitter_s**-2.0
-    right -= weight * state.errors
+    more = (J.T @ J + scipy.sparse.diags_array(weight)).tocsr()
+    of_first = more[:rest, :rest].tocoo()
+    quadratic.first[of_first.row, of_first.col] += of_first.data
+    right = quadratic.b - J.T @ np.concatenate([standing_r, mean_r]) - weight * state.errors
     # Handed over: they are large, and only their parts are needed further on.
-    held = [less, (sparse + scipy.sparse.diags_array(weight)).tocsr()]
-    del sparse, less
+    held = [quadratic.V_t, quadratic.others + more[rest:], quadratic.first]
+    del quadratic
     blocks = layout.of_surfaces()
-    H, b, surfaces = eliminated(held.pop(), held.pop(), right, layout.plane, blocks)
+    H, b, surfaces = eliminated(held.pop(), held.pop(), held.pop(), right, blocks)
     prior.add_to(H, b, state.moved)
     if layout.parameters:
         own = slice(6 * layout.poses, layout.rate)

@@ -142,9 +142,10 @@ def test_rows_follow_the_surfaces_that_are_eliminated() -> None:
     rng = np.random.default_rng(3)
     J = rng.standard_normal((20, 7))
     J[:10, 3:5], J[10:, 5:] = 0.0, 0.0  # two surfaces that are not coupled
-    H, nothing = J.T @ J, scipy.sparse.csr_array((7, 1))
+    H, nothing = J.T @ J, scipy.sparse.csr_array((1, 7))
     blocks = [np.array([3, 4]), np.array([5, 6])]
-    surfaces = eliminated(scipy.sparse.csr_array(H), nothing, np.zeros(7), 3, blocks)[2]
+    others = scipy.sparse.csr_array(H[3:])
+    surfaces = eliminated(H[:3, :3].copy(), others, nothing, np.zeros(7), blocks)[2]
     rows = rng.standard_normal((2, 7))
     reduced, cov = surfaces.reduced(rows)
     inverse = np.linalg.inv(H[3:, 3:])

@@ -236,8 +236,9 @@ def test_elimination_by_surfaces_solves_the_whole_system() -> None:
         touched = np.concatenate([[k, k + 2], own[:2]])
         V[touched, k] = rng.standard_normal(4)
     H, b = J.T @ J - V @ V.T, rng.standard_normal(12)
-    sparse, less = scipy.sparse.csr_array(J.T @ J), scipy.sparse.csr_array(V)
-    reduced, right, surfaces = eliminated(sparse, less, b, rest, blocks)
+    others, less = scipy.sparse.csr_array((J.T @ J)[rest:]), scipy.sparse.csr_array(V.T)
+    reduced, right, surfaces = eliminated(H[:rest, :rest].copy(), others, less, b, blocks)
+    assert reduced == pytest.approx(reduced.T, abs=1e-12)
     factor = factor_of(reduced)
     whole = np.linalg.solve(H, b)
     assert surfaces.follow(solved(factor, right)) == pytest.approx(whole, rel=1e-8)
@@ -246,9 +247,9 @@ def test_elimination_by_surfaces_solves_the_whole_system() -> None:
 
 
 def test_a_surface_without_information_is_named() -> None:
-    none = scipy.sparse.csr_array((3, 3))
+    none = scipy.sparse.csr_array((2, 3))
     with pytest.raises(SolveError, match="surface"):
-        eliminated(none, none, np.zeros(3), 1, [np.array([1, 2])])
+        eliminated(np.ones((1, 1)), none, none, np.zeros(3), [np.array([1, 2])])
 
 
 STANDING = Standing(

@@ -379,7 +379,8 @@ class _Distances:
     def __init__(self, other: OtherStrips, rows: Rows) -> None:
         layout = other.layout
         self._other = other
-        H = (rows.J.T @ rows.J).tocsr()
+        # Of what belongs to no surface the rows are not asked for: most of the work.
+        H = (rows.J[:, layout.plane :].T @ rows.J).tocsr()
         right = rows.of_noise - rows.J.T @ rows.r
         shared = (rows.J.T @ rows.shared).tocsr()
         m = len(other.strip_of)
@@ -395,7 +396,7 @@ class _Distances:
             bends = layout.bend + layout.strips * np.arange(BENDS * layout.bent) + k
             own = layout.strip_error + layout.strips * other.lidar_of[at] + k
             columns = np.concatenate([plane, bends, own])
-            part = H[columns]
+            part = H[columns - layout.plane]
             A = part[:, columns].toarray()
             sigmas = [TILT_PRIOR_RAD] * 2 + [PLACE_PRIOR_M]
             sigmas += [other.nuisances.bend[k]] * len(bends) + [PLACE_PRIOR_M] * len(at)

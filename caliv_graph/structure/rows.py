@@ -9,7 +9,7 @@ import scipy.sparse
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.layout import Layout, Nuisances
-from caliv_graph.structure.residuals import PLANE_ROWS, Geometry, rows_of
+from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings, without_own_error
 from caliv_graph.structure.sparse_parts import difference_of_squares, members
 
@@ -21,8 +21,8 @@ FITTED = 2.5
 to the points, noise included. Of 12 points in two channels 0.79 of it are there, of 21 in three
 0.88, of 40 in four 0.93 (simulated)."""
 
-TOGETHER = 1000
-"""Sightings whose rows are made at a time: temporary memory is small."""
+LEAST_PIVOT = 1e-12
+"""Part of a moment that is its rounding: what is left of it says nothing."""
 
 TILT_PRIOR_RAD = 5.0
 
@@ -35,7 +35,7 @@ straight drive: 5 rad / sqrt(1000) is five times the guess's 30 mrad."""
 
 @dataclass(frozen=True)
 class Rows:
-    """Whitened residuals of all sightings.
+    """Whitened residuals of all sightings: the first of each, then the second of each, ...
 
     Attributes:
         J: (4 Q, D).
@@ -71,7 +71,8 @@ class Rows:
         others = (J[:, rest:].T.tocsr() @ J).tocsr()
         # What two scans have in common are errors of their LiDARs.
         sightings, groups = members(self.scan), members(self.scan_of_group)
-        rows = {s: (4 * own[:, None] + np.arange(4)).ravel() for s, own in sightings.items()}
+        each = len(self.scan) * np.arange(4)[:, None]
+        rows = {scan: (each + own).ravel() for scan, own in sightings.items()}
         first = difference_of_squares(J, rows, V_t, groups, rest)
         return Quadratic(first, others, V_t, np.asarray(b))
 
@@ -120,21 +121,20 @@ def whitened(
     tilt = np.sqrt((own_tilt * more) ** 2 + (alike - 1.0) * strip_tilt**2)
     S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]
-    values, vectors = np.linalg.eigh(S)
-    C = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    C = roots_of(S)
     q = sightings.count
-    J = rows_of(_times(geometry.by, C), geometry.columns, layout.size)
-    J.eliminate_zeros()
+    derivatives = _Derivatives.of(geometry)
+    J = derivatives.rows(C, layout.size)
     groups, first, number = np.unique(group, return_index=True, return_inverse=True)
-    by_offset = (nuisances.shared * more)[:, None] * C[:, 3]
-    own_group = np.broadcast_to(number.ravel()[:, None], by_offset.shape)
+    # The last coordinate of h, to which an offset adds, is in the first residual alone.
+    by_offset = nuisances.shared * more * C[:, 3, 0]
     shared = scipy.sparse.csr_array(
-        (by_offset.ravel(), (np.arange(4 * q), own_group.ravel())), shape=(4 * q, len(groups))
+        (by_offset, (np.arange(q), number.ravel())), shape=(4 * q, len(groups))
     )
     noise *= _bearable(geometry, S, noise, sightings.strip)[:, None, None]
     of_plane = np.einsum("qij,qj->qi", noise, geometry.placed)
-    pull = np.einsum("qci,qi->qc", geometry.by, of_plane)
-    of_noise = np.bincount(geometry.columns.ravel(), pull.ravel(), minlength=layout.size)
+    pull = derivatives.along(of_plane)
+    of_noise = np.bincount(derivatives.column, pull, minlength=layout.size)
     beams = geometry.beams
     if beams is not None:
         less = -FITTED / sightings.points[:, None]
@@ -147,18 +147,77 @@ def whitened(
         )
     of_offset = nuisances.shared * more * of_plane[:, 3]
     of_groups = np.bincount(number.ravel(), of_offset, len(groups))
-    r = np.einsum("qi,qij->qj", geometry.plain, C).ravel()
+    r = np.einsum("qi,qij->jq", geometry.plain, C).ravel()
     scan = sightings.scan
     return Rows(J, r, shared, np.asarray(of_noise), np.asarray(of_groups), scan, scan[first])
 
 
-def _times(by: Array, C: Array) -> Array:
-    """(Q, 4, C) transposed products of derivatives (Q, C, 4) and (Q, 4, 4); no copy of all."""
-    out = np.empty((len(by), 4, by.shape[1]))
-    for begin in range(0, len(by), TOGETHER):
-        some = slice(begin, begin + TOGETHER)
-        out[some] = np.swapaxes(by[some] @ C[some], 1, 2)
-    return out
+def roots_of(S: Array) -> Array:
+    """(Q, 4, 4) C with `C C^T = S` of information matrices S (Q, 4, 4), which may be singular.
+
+    Cholesky's, from the last coordinate on: in columns but the first it is zero, and derivatives
+    that only shift a plane are so as well.
+    """
+    C, left = np.zeros_like(S), S.copy()
+    order = [3, 0, 1, 2]
+    for k, i in enumerate(order):
+        pivot = left[:, i, i]
+        known = pivot > LEAST_PIVOT * S[:, i, i]
+        column = left[:, :, i] / np.sqrt(np.where(known, pivot, 1.0))[:, None]
+        column[~known] = 0.0
+        column[:, order[:k]] = 0.0
+        C[:, :, k] = column
+        left -= column[:, :, None] * column[:, None, :]
+    return C
+
+
+@dataclass(frozen=True)
+class _Derivatives:
+    """The derivatives of a geometry that are not zero, one sighting after the other.
+
+    Most errors of beams are those of channels that a sighting has no point of.
+
+    Attributes:
+        each: (Q,) how many a sighting has.
+        by: (4, n) derivatives, by the coordinates of h.
+        column: (n,).
+    """
+
+    each: IntArray
+    by: Array
+    column: IntArray
+
+    @classmethod
+    def of(cls, geometry: Geometry) -> _Derivatives:
+        """Those of a geometry."""
+        by = geometry.by
+        used = by[:, :, 3] != 0.0
+        for i in range(3):
+            used |= by[:, :, i] != 0.0
+        at = np.flatnonzero(used)
+        some = by.reshape(-1, 4)[at]
+        return cls(
+            np.count_nonzero(used, axis=1),
+            np.ascontiguousarray(some.T),
+            geometry.columns.ravel()[at].astype(np.int32),
+        )
+
+    def along(self, of: Array) -> Array:
+        """(n,) products with vectors (Q, 4)."""
+        total = np.zeros(len(self.column))
+        for of_i, by_i in zip(of.T, self.by, strict=True):
+            if of_i.any():
+                total += np.repeat(of_i, self.each) * by_i
+        return total
+
+    def rows(self, C: Array, size: int) -> scipy.sparse.csr_array:
+        """(4 Q, `size`) products with roots (Q, 4, 4) of `roots_of`."""
+        values = np.concatenate([self.along(C[:, :, k]) for k in range(4)])
+        ends = np.concatenate([[0], np.cumsum(np.tile(self.each, 4))]).astype(np.int32)
+        shape = (4 * len(C), size)
+        J = scipy.sparse.csr_array((values, np.tile(self.column, 4), ends), shape=shape)
+        J.eliminate_zeros()
+        return J
 
 
 def repetition(nuisances: Nuisances, repeated: IntArray) -> Array:

@@ -494,6 +494,32 @@ def test_the_joint_loop_has_one_end(sparse: Tried, monkeypatch: pytest.MonkeyPat
     assert apart(sparse, further) < 0.3
 
 
+def test_where_surfels_are_few_the_end_is_the_mean_of_several(
+    sparse: Tried, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends: list[list[gtsam.Pose3]] = []
+    mean_of = refine._Loop.move_to_mean
+
+    def kept(loop: refine._Loop, of: Sequence[Sequence[gtsam.Pose3]]) -> None:
+        ends.extend([*one] for one in of)
+        mean_of(loop, of)
+
+    monkeypatch.setattr(refine._Loop, "move_to_mean", kept)
+    monkeypatch.setattr(refine, "FEW_SURFELS", 10_000)
+    several = try_out(sparse.drive)
+
+    assert len(ends) == 1 + refine.OTHER_STARTS
+    further = refine.further_refinements(sparse.drive.config.noise.lidar_range_m)
+    more = len(several.run.solution.course) - len(sparse.run.solution.course)
+    assert 0 < more <= refine.OTHER_STARTS * further
+    # Each is another, all are of the same data, and the result is where their mean is.
+    for i, name in enumerate(several.poses):
+        steps = [vehicle_axes_difference(end[i], several.poses[name]) for end in ends]
+        assert np.abs(steps).max() > 1e-6
+        assert np.mean(steps, axis=0) == pytest.approx(np.zeros(6), abs=1e-6)
+    assert apart(sparse, several) < 1.0
+
+
 # ------------------------------------------------------------------ outliers
 
 

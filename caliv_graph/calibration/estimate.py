@@ -27,6 +27,8 @@ from caliv_graph.calibration.no_target import (
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.calibration.refine import (
+    OTHER_STARTS,
+    further_refinements,
     per_placement,
     refined,
     refinements,
@@ -338,8 +340,9 @@ def _solved(
         solve = under_clock_prior(solve, reduced, None)
         settle(solve, registrations, step_of_all(solve))
     most = refinements(config.noise.lidar_range_m)
+    total = most + OTHER_STARTS * further_refinements(config.noise.lidar_range_m)
     with (
-        progress.stage("refining shape and graph together", most) as advance,
+        progress.stage("refining shape and graph together", total) as advance,
         keeping_larger_arrays(),
     ):
         if config.solve.mode == "staged":

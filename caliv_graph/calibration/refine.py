@@ -43,11 +43,12 @@ from caliv_graph.calibration.solve import (
     step_of_mode,
 )
 from caliv_graph.config.range_errors import range_errors
-from caliv_graph.geometry.se3 import stack, unstack
+from caliv_graph.geometry.se3 import stack, unstack, vehicle_axes_difference
 from caliv_graph.products import Array, Iteration, Registration, Solution
 from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import (
     FINE_SIGMA_M,
+    TILES_SETTLE,
     JointRegistration,
     annealing_steps,
     left_step,
@@ -83,9 +84,21 @@ STEP_SIGMAS = 0.1
 the accuracy of 100 clouds of a chair. Or else in joint standard deviations of the extrinsics."""
 
 
+FEW_SURFELS, OTHER_STARTS = 100, 2
+"""Where a target has fewer surfels, for want of points, the shapes begin so many times more, on
+other points, and the mean of all ends is taken. Where the surface is cut into them moves the
+extrinsics: by one to two standard deviations with 50 surfels, by 0.1 to 0.3 with 300."""
+
+
 def refinements(sigma_range_m: float) -> int:
     """How many iterations there may be, at this noise along the beam (metres)."""
     return max(REFINEMENTS, annealing_steps(FINE_SIGMA_M, sigma_range_m) + LAST_REFINEMENTS)
+
+
+def further_refinements(sigma_range_m: float) -> int:
+    """How many iterations each other start may take, at this noise along the beam (metres)."""
+    annealed = annealing_steps(FINE_SIGMA_M, sigma_range_m)
+    return annealed + TILES_SETTLE + LAST_REFINEMENTS
 
 
 def refined(
@@ -94,7 +107,7 @@ def refined(
     most: int,
     advance: Callable[..., None],
 ) -> Solution:
-    """Expectation-maximisation whose M-step is the graph solve, `most` iterations.
+    """Expectation-maximisation whose M-step is the graph solve, `most` iterations from one start.
 
     `state` (of `solve_registered`) and `states`, the registration of each placement, are taken
     along; `advance` is called after each iteration.
@@ -124,7 +137,7 @@ def registered_with_motion(
         state: of `solve_registered`; gets values, weights, the scale of the registration, and what
             biases of the ranges do to the poses.
         states: the registration of each placement, taken along.
-        most: iterations.
+        most: iterations of the first start.
         advance: is called after each.
 
     Raises:
@@ -193,6 +206,18 @@ def _settled(
         course.append(loop.iterate(len(course) + 1))
         converged = loop.has_converged(course[-1])
         advance()
+    if any(len(shape.mixture.weights) < FEW_SURFELS for shape in states):
+        ends = [loop.extrinsics()]
+        further = further_refinements(state.config.noise.lidar_range_m)
+        for draw in range(1, OTHER_STARTS + 1):
+            loop.begin_shapes(draw)
+            for _ in range(further):
+                course.append(loop.iterate(len(course) + 1))
+                advance()
+                if loop.has_converged(course[-1]):
+                    break
+            ends.append(loop.extrinsics())
+        loop.move_to_mean(ends)
     return loop, course, converged
 
 
@@ -241,17 +266,29 @@ class _Loop:
         """T_vehicle_lidar of every LiDAR."""
         return list(self.state.problem.extrinsics(self.state.values).values())
 
-    def begin_shapes(self) -> None:
+    def move_to_mean(self, ends: Sequence[Sequence[gtsam.Pose3]]) -> None:
+        """Takes the extrinsics to the mean of these, the last of which they are; all else follows.
+
+        The ends are a fraction of a sigma apart: the mean of their tangents is the mean.
+        """
+        now = self.extrinsics()
+        steps = [
+            np.concatenate([vehicle_axes_difference(T, T0) for T, T0 in zip(end, now, strict=True)])
+            for end in ends
+        ]
+        self.state.values = self.linearised(*self.expected()).move(np.mean(steps, axis=0))
+
+    def begin_shapes(self, draw: int = 0) -> None:
         """New normals and a new mixture, at the poses of the solved graph: EM ends near its start.
 
-        The surfels are those of beams from now on.
+        The surfels are those of beams from now on. Another `draw` begins on other points.
         """
         _hand_weights(self.state, self.states)
         lines = linearise_clouds(self.state.problem, self.state.values)
         for shape, (R, t) in zip(self.states, self.poses_of_clouds(lines), strict=True):
             shape.refine_normals(R, t)
             shape.by_beams, shape.held_along = True, 0.0
-            shape.seed(R, t, FINE_SIGMA_M)
+            shape.seed(R, t, FINE_SIGMA_M, draw)
         self.ranges = tuple(OwnRanges.of(shape.clouds) for shape in self.states)
 
     def left_out(self, lines: CloudLinearisation) -> float:

@@ -61,6 +61,7 @@ def seed_mixture(
     distinct: float | None = None,
     trusted: BoolArray | None = None,
     everywhere: bool = False,
+    draw: int = 0,
 ) -> Mixture:
     """The initial mixture of width `sigma_m`: components on points with reliable normals.
 
@@ -69,7 +70,8 @@ def seed_mixture(
     translations t (J, 3). There are fewer `components` if few points are `distinct`
     (`POINTS_PER_COMPONENT`): those of scans of one view count as one. None: all are. Clouds (J,)
     that are not `trusted` get no surfels: a cloud in the wrong place would explain itself.
-    `everywhere`: on points whose normals are not reliable as well, as on thin parts.
+    `everywhere`: on points whose normals are not reliable as well, as on thin parts. Each `draw`
+    takes others, as far as there are some.
     """
     distinct = len(stack.points) if distinct is None else distinct
     points = stack.moved(R, t)
@@ -86,7 +88,7 @@ def seed_mixture(
     starts = np.searchsorted(cloud[by_cloud], cloud[by_cloud], side="left")
     rank = np.empty(len(order), dtype=np.int64)
     rank[by_cloud] = np.arange(len(order)) - starts
-    chosen = order[np.argsort(rank, kind="stable")][:components]
+    chosen = np.roll(order[np.argsort(rank, kind="stable")], -draw * components)[:components]
     count = len(chosen)
     return Mixture(
         means_target=points[chosen].copy(),

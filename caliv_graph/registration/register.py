@@ -204,8 +204,11 @@ class JointRegistration:
             part._near = self._near[self.clouds.points_of(which)]
         return part
 
-    def seed(self, R: Array, t: Array, sigma_m: float) -> None:
-        """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t)."""
+    def seed(self, R: Array, t: Array, sigma_m: float, draw: int = 0) -> None:
+        """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t).
+
+        Another `draw` begins on other points.
+        """
         self._depth_m = depth_of(self.clouds.moved(R, t))
         self._near = None
         self._by_beams_for = 0
@@ -221,6 +224,7 @@ class JointRegistration:
             distinct,
             trusted if trusted.sum() >= 2 else None,
             self.by_beams,
+            draw,
         )
 
     def expect(self, R: Array, t: Array) -> ShapeQuadratic:

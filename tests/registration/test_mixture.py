@@ -1000,6 +1000,15 @@ def test_seeds_are_the_same_points_wherever_the_clouds_are() -> None:
     assert [row[tuple(m)] for m in here.tolist()] == [moved_row[tuple(m)] for m in there.tolist()]
 
 
+def test_another_draw_begins_on_other_points() -> None:
+    stack, R, t = seed_case()
+    draws = [seed_mixture(stack, R, t, 20, 0.03, draw=draw).means_target for draw in range(3)]
+    places = [{tuple(p) for p in means.tolist()} for means in draws]
+    assert [len(p) for p in places] == [20, 20, 20]
+    assert not places[0] & places[1]
+    assert not (places[0] | places[1]) & places[2]
+
+
 def test_seeds_everywhere_are_on_parts_whose_normals_are_not_known() -> None:
     # A face of 600 points, and a leg of 200 with two columns of points on it, whose normals nobody
     # knows: a quarter of the points, and of the surfels.

@@ -24,7 +24,6 @@ from caliv_graph.products import (
     TargetObservation,
 )
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
-from caliv_graph.trajectory.stated_noise import stated_noise_warnings
 from caliv_graph.wording.mounting import placement_sentence
 
 
@@ -36,8 +35,7 @@ class Look:
         observations: the targets' clouds; None if the search stopped.
         findings: values of the config that the raw data contradict, the heading included.
         problems: what stopped the search, a sentence each.
-        notes: where LiDARs without an initial guess were found, and noise figures that are too
-            small, a sentence each.
+        notes: where LiDARs without an initial guess were found, a sentence each.
         trajectory: of the vehicle; None if it could not be smoothed.
         config: with the mountings that were found; None if none was looked for.
     """
@@ -80,7 +78,6 @@ def _look(recording: Recording, config: Config, progress: Progress) -> Look:
             return Look(None, findings, tuple(problems), notes)
         trajectories = smooth_trajectories([recording], config, [[]], motions)
         (trajectory,) = trajectories
-        notes += tuple(stated_noise_warnings(trajectories, config))
         config, placements = place_lidars([recording], trajectories, config, progress)
         notes += tuple(map(placement_sentence, placements))
         findings += smoothed_findings([recording], trajectories, motions, config, progress)

@@ -55,7 +55,6 @@ from caliv_graph.trajectory.select import (
     smooth_trajectories,
     takes_given_poses,
 )
-from caliv_graph.trajectory.stated_noise import stated_noise_warnings
 from caliv_graph.wording.mounting import (
     mistake_sentence,
     placement_sentence,
@@ -188,7 +187,6 @@ def prepare(
     warnings = [*pauses, *(w for r in recordings for w in r.warnings())]
     warnings += map(placement_sentence, placements)
     warnings += [w for t in trajectories for w in t.warnings]
-    warnings += stated_noise_warnings(trajectories, config)
     warnings += [w for o in observations for w in o.warnings]
     if no_target is not None:
         warnings.append(no_target_sentence(no_target.what))

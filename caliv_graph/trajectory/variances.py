@@ -95,38 +95,31 @@ NODES = 600
 """First nodes of the drive that are used: a minute, which tells the noise to some percent."""
 
 
-def noise_keys(data: SmootherInput) -> dict[str, str | None]:
-    """Names of the noise levels of an input, and their keys in the config's `noise`."""
-    keys: dict[str, str | None] = {
-        "gnss_horizontal": "gnss_horizontal_m",
-        "gnss_vertical": "gnss_vertical_m",
-        "gyroscope": "gyroscope_density_rad_s_sqrthz",
-        "accelerometer": "accelerometer_density_m_s2_sqrthz",
-        "orientation": "orientation_deg",
-        "velocity": "velocity_m_s",
-        "heading": "heading_deg",
-        "baseline": "gnss_horizontal_m",
-    }
-    if data.wheels is not None:
-        for name in ("gyroscope", "accelerometer"):
-            del keys[name]
-        if data.wheels.yaw_rate:
-            keys["yaw_rate"] = "yaw_rate_rad_s"
-        else:
-            keys["steering"] = None
-        keys["braking"] = None
-    if data.motion.twist is not None and is_planar(data.motion.twist):
-        del keys["velocity"]
-        keys["speed"] = "velocity_m_s"
-    return keys
-
-
 def free_components(data: SmootherInput) -> list[str]:
     """Names of the noise levels that the config does not give."""
     noise = data.config.noise
-    return [
-        name for name, key in noise_keys(data).items() if key is None or getattr(noise, key) is None
-    ]
+    configured = {
+        "gnss_horizontal": noise.gnss_horizontal_m,
+        "gnss_vertical": noise.gnss_vertical_m,
+        "gyroscope": noise.gyroscope_density_rad_s_sqrthz,
+        "accelerometer": noise.accelerometer_density_m_s2_sqrthz,
+        "orientation": noise.orientation_deg,
+        "velocity": noise.velocity_m_s,
+        "heading": noise.heading_deg,
+        "baseline": noise.gnss_horizontal_m,
+    }
+    if data.wheels is not None:
+        for name in ("gyroscope", "accelerometer"):
+            del configured[name]
+        if data.wheels.yaw_rate:
+            configured["yaw_rate"] = noise.yaw_rate_rad_s
+        else:
+            configured["steering"] = None
+        configured["braking"] = None
+    if data.motion.twist is not None and is_planar(data.motion.twist):
+        del configured["velocity"]
+        configured["speed"] = noise.velocity_m_s
+    return [name for name, value in configured.items() if value is None]
 
 
 def estimated_scales(
@@ -143,18 +136,6 @@ def estimated_scales(
     """
     if data.config.robust.kernel == "none":
         return {}  # everything is believed, jumps of the fixes too
-    return contradicted(likelihood_of(data, nodes, states, dropped, errors, free_components(data)))
-
-
-def likelihood_of(
-    data: SmootherInput,
-    nodes: IntArray,
-    states: States,
-    dropped: IntArray,
-    errors: Sequence[CorrelatedError],
-    free: Sequence[str],
-) -> NoiseLikelihood:
-    """The likelihood of noise levels `free` at an estimate, as `estimated_scales` has them."""
     nodes = nodes[:NODES]
     part = first_nodes(states, len(nodes))
     graph = build_graph(data, nodes, part, dropped, "none")
@@ -174,16 +155,17 @@ def likelihood_of(
     bridged = iter(bridged_s(data.inertial, nodes) > 0.0)
     # What happens in a gap is no noise of the IMU.
     kinds = ["gap" if kind == "imu" and next(bridged) else kind for kind in graph.kinds]
-    return NoiseLikelihood(
+    likelihood = NoiseLikelihood(
         graph.factors.linearize(values),
         kinds,
         [key_yaw_bias()] if data.yaw_bias else [],
         nodes,
         part.R_map_imu,
         errors,
-        free,
+        free_components(data),
         columns,
     )
+    return contradicted(likelihood)
 
 
 @dataclass

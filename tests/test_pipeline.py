@@ -505,19 +505,22 @@ def test_where_surfels_are_few_the_end_is_the_mean_of_several(
         mean_of(loop, of)
 
     monkeypatch.setattr(refine._Loop, "move_to_mean", kept)
-    monkeypatch.setattr(refine, "FEW_SURFELS", 10_000)
-    several = try_out(sparse.drive)
+    drive = sparse.drive.asked(registration=COARSE.model_copy(update={"components": 1000}))
+    one = try_out(drive)
+    assert not ends
+    monkeypatch.setattr(refine, "FEW_SURFELS", 1000)  # the points are for fewer
+    several = try_out(drive)
 
     assert len(ends) == 1 + refine.OTHER_STARTS
     further = refine.further_refinements(sparse.drive.config.noise.lidar_range_m)
-    more = len(several.run.solution.course) - len(sparse.run.solution.course)
+    more = len(several.run.solution.course) - len(one.run.solution.course)
     assert 0 < more <= refine.OTHER_STARTS * further
     # Each is another, all are of the same data, and the result is where their mean is.
     for i, name in enumerate(several.poses):
         steps = [vehicle_axes_difference(end[i], several.poses[name]) for end in ends]
         assert np.abs(steps).max() > 1e-6
         assert np.mean(steps, axis=0) == pytest.approx(np.zeros(6), abs=1e-6)
-    assert apart(sparse, several) < 1.0
+    assert apart(one, several) < 1.0
 
 
 # ------------------------------------------------------------------ outliers

@@ -21,7 +21,7 @@ from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.geometry.se3 import retract_vehicle_axes, right_to_vehicle_axes, stack
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.registration.moments import Responsibilities
-from caliv_graph.registration.register import TRUSTED_WEIGHT, JointRegistration
+from caliv_graph.registration.register import JointRegistration
 
 GROUPS = 4
 """Parts of the clouds that are left out in turn: three degrees of freedom for each of twelve
@@ -40,6 +40,10 @@ tenth on sparse clouds. Fewer where the scale will not come to 1, below which it
 
 LEAST_LIDAR_CLOUDS = 2 * GROUPS
 """Clouds of every LiDAR for a jackknife: two of each part. As many views, too."""
+
+NO_SAY = 1e-3
+"""Robust weight up to which a cloud is none to the jackknife: without it nothing changes. One of
+0.05 to 0.5 has less of a say, but leaving it out tells something."""
 
 SCANS_OF_A_VIEW = 1.5
 """Scans of each view at most, in the mean, where a LiDAR has fewer than `MANY_VIEWS`: left out one
@@ -64,14 +68,14 @@ def jackknife_scale(
         states: the registration of each placement at the solution; they stay as they are.
         lines: predicted poses of the clouds there.
     """
-    trusted = np.concatenate([state.weights > TRUSTED_WEIGHT for state in states])
-    if not _tell(problem, trusted):
+    say = np.concatenate([state.weights > NO_SAY for state in states])
+    if not _tell(problem, say):
         return 1.0
     # Where the data tell nothing, wide guesses would let the parts wander off along what they do
     # not determine, and the way is curved.
     usual = np.tile(DEFAULT_GUESS_SIGMAS**-2.0, len(problem.lidars))
     prior = np.maximum(problem.guess_information(), np.diag(usual))
-    parts = _parts(problem, states, lines, trusted)
+    parts = _parts(problem, states, lines, say)
     every = _placements(problem, extrinsics, states, lines, parts)
     H, _ = _system(every, extrinsics)
     known = np.linalg.solve(H + prior, H)
@@ -103,35 +107,35 @@ def _stays_below_one(scales: Sequence[float]) -> bool:
     return scales[-1] + left * max(scales[-1] - scales[-2], 0.0) < 1.0
 
 
-def _distinct_views(problem: Problem, trusted: BoolArray) -> Array:
+def _distinct_views(problem: Problem, say: BoolArray) -> Array:
     """(n,) different views of each LiDAR: scans of one view count as one.
 
-    Clouds (J,) that are not `trusted` are none: without one of them nothing changes.
+    Clouds (J,) that have no `say` are none.
     """
-    each = trusted / problem.all_views()
+    each = say / problem.all_views()
     distinct = np.bincount(problem.cloud_lidar, each, minlength=len(problem.lidars))
     return np.asarray(np.round(distinct, 6))  # three thirds are one
 
 
-def _tell(problem: Problem, trusted: BoolArray) -> bool:
+def _tell(problem: Problem, say: BoolArray) -> bool:
     """Whether every LiDAR with clouds has enough of different views for a jackknife."""
-    distinct = _distinct_views(problem, trusted)
-    count = np.bincount(problem.cloud_lidar, trusted, minlength=len(problem.lidars))
+    distinct = _distinct_views(problem, say)
+    count = np.bincount(problem.cloud_lidar, say, minlength=len(problem.lidars))
     few = (distinct >= LEAST_LIDAR_CLOUDS) & (count <= SCANS_OF_A_VIEW * distinct)
     return bool(((distinct >= MANY_VIEWS) | few)[count > 0].all())
 
 
-def _groups(problem: Problem, trusted: BoolArray) -> IntArray:
+def _groups(problem: Problem, say: BoolArray) -> IntArray:
     """(J,) part that each cloud belongs to: runs of `TOGETHER` clouds of a LiDAR, in turn.
 
-    From placement to placement the turn goes on. Clouds that are not `trusted` are in the first.
+    From placement to placement the turn goes on. Clouds that have no `say` are in the first.
     """
     out = np.zeros(problem.clouds, dtype=np.int64)
-    in_a_row = np.where(_distinct_views(problem, trusted) < MANY_VIEWS, 1, TOGETHER)
+    in_a_row = np.where(_distinct_views(problem, say) < MANY_VIEWS, 1, TOGETHER)
     for a, together in enumerate(in_a_row.tolist()):
         runs = 0
         for m in range(problem.placements):
-            of_lidar = trusted & (problem.cloud_lidar == a)
+            of_lidar = say & (problem.cloud_lidar == a)
             own = np.flatnonzero(of_lidar & (problem.cloud_placement == m))
             own = own[np.argsort(problem.cloud_pose[own], kind="stable")]
             number = runs + np.arange(len(own)) // together
@@ -159,10 +163,10 @@ def _parts(
     problem: Problem,
     states: Sequence[JointRegistration],
     lines: CloudLinearisation,
-    trusted: BoolArray,
+    say: BoolArray,
 ) -> list[list[_Part]]:
     """The parts of every placement, without those that are empty."""
-    group = _groups(problem, trusted)
+    group = _groups(problem, say)
     out = []
     for own, state in zip(problem.clouds_of_placements(), states, strict=True):
         R, t = stack(lines.predicted[own])

@@ -206,7 +206,8 @@ def _settled(
         course.append(loop.iterate(len(course) + 1))
         converged = loop.has_converged(course[-1])
         advance()
-    if any(len(shape.mixture.weights) < FEW_SURFELS for shape in states):
+    few = min(FEW_SURFELS, state.config.registration.components)
+    if any(len(shape.mixture.weights) < few for shape in states):
         ends = [loop.extrinsics()]
         further = further_refinements(state.config.noise.lidar_range_m)
         for draw in range(1, OTHER_STARTS + 1):
@@ -417,7 +418,7 @@ class _Loop:
         small = last.turn_rad < STEP_TOLERANCE[0] and last.shift_m < STEP_TOLERANCE[1]
         return bool(
             self.fine > BIAS_AFTER
-            and all(s.finest for s in self.states)
+            and all(s.settled for s in self.states)
             and (small or last.sigmas < STEP_SIGMAS)
             and last.weight_change < 10.0 * WEIGHT_TOLERANCE
         )

@@ -251,7 +251,7 @@ class JointRegistration:
         self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
-        if self.finest and not self._settled:
+        if self.finest and not self.settled:
             taken_up = quadratic.shape_parameters()
             self.noise = self._noise_now().fitted(who.heights, taken_up, self._configured)
             self._shared = self.noise.shared_part(who.heights)
@@ -260,7 +260,7 @@ class JointRegistration:
         return quadratic
 
     @property
-    def _settled(self) -> bool:
+    def settled(self) -> bool:
         """Whether tiles and noise are what they are (`TILES_SETTLE`)."""
         return self._by_beams_for >= TILES_SETTLE
 
@@ -272,7 +272,7 @@ class JointRegistration:
         """M-step of the components at the new `T_target_lidar` (R, t)."""
         if self._expected is None:
             raise RegistrationError(f"{self.observation.name}: E-step missing")
-        mixture, held = self.mixture, self._settled
+        mixture, held = self.mixture, self.settled
         self._mixture = maximise_shape(
             self.clouds, R, t, mixture, self._floor, *self._expected, tiles_held=held
         )

@@ -25,6 +25,7 @@ from caliv_graph.uncertainty.consistency import (
     CloudCount,
     CoarseRegistrations,
     Contradiction,
+    GuessesTogether,
     Heading,
     Strain,
 )
@@ -109,6 +110,25 @@ def test_a_clock_that_another_mistake_makes_late_is_not_to_be_corrected(
     calibration = replace(nothing_calibrated(), vehicle={"gnss_time_offset": late})
     _, warnings, _ = checked(calibration, monkeypatch, ranked_suspects=(suspect,))
     assert any("correct the clock" in warning for warning in warnings) == said
+
+
+def test_a_doubt_about_all_guesses_stands_in_place_of_one_about_a_guess(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    guess = Suspect("lidars.roof.initial", (0.2,), (0.05,), (0.2,), ("m",), 0.9, 4.2, 4.2)
+    _, (alone,), _ = checked(nothing_calibrated(), monkeypatch, ranked_suspects=(guess,))
+    assert "lidars.roof.initial" in alone
+    moved = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.2, 0.0]))
+    frame = GuessesTogether(("roof", "left"), moved, 4.4, None, 0.0, True)
+    together = {"ranked_suspects": (guess,), "perhaps_together": frame}
+    _, (said,), _ = checked(nothing_calibrated(), monkeypatch, **together)
+    assert "may all be off by the same (together 4.4 sigma)" in said
+    assert "lidars.roof.initial" not in said
+    # Beside a contradiction of a guess it would say the same twice.
+    off = GuessesTogether(("roof", "left"), moved, 7.0, None, 0.0, True)
+    monkeypatch.setattr(consistency, "contradictions", lambda _: [off])
+    _, warnings, _ = checked(nothing_calibrated(), monkeypatch, perhaps_together=frame)
+    assert warnings == ()
 
 
 def test_the_lidars_that_contradictions_are_about_are_given_by_name(

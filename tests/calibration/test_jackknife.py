@@ -34,7 +34,7 @@ CLOUDS = 32
 
 
 def every(problem: Problem) -> BoolArray:
-    """All clouds are trusted."""
+    """All clouds have a say."""
     return np.ones(problem.clouds, dtype=bool)
 
 
@@ -237,15 +237,23 @@ def test_few_clouds_tell_it_too_but_not_very_few() -> None:
     assert seen_chair(LEAST_LIDAR_CLOUDS - 1, shared_m=0.02).scale() == 1.0
 
 
-def test_clouds_that_are_not_trusted_are_no_clouds() -> None:
+def test_clouds_without_a_say_are_no_clouds() -> None:
     """Without one of them nothing changes: a part of them alone says that nothing does."""
     chair = seen_chair()
-    trusted = np.arange(CLOUDS) % 4 != 1  # all of a part, if they were put in turn
-    group = _groups(chair.problem, trusted)
-    assert np.bincount(group[trusted]).tolist() == [CLOUDS * 3 // 4 // GROUPS] * GROUPS
+    say = np.arange(CLOUDS) % 4 != 1  # all of a part, if they were put in turn
+    group = _groups(chair.problem, say)
+    assert np.bincount(group[say]).tolist() == [CLOUDS * 3 // 4 // GROUPS] * GROUPS
     few = copy(chair.state)
     few.weights = np.where(np.arange(CLOUDS) < LEAST_LIDAR_CLOUDS - 1, 1.0, 0.0)
     assert jackknife_scale(chair.problem, [chair.extrinsic], [few], chair.lines) == 1.0
+
+
+def test_clouds_of_little_weight_are_in_all_parts() -> None:
+    """Together in one part they would make it unlike the others: a scale of 5 on a sound chair."""
+    chair = seen_chair()
+    little = copy(chair.state)
+    little.weights = np.where(np.arange(CLOUDS) < 9, 1.0, 0.45)
+    assert jackknife_scale(chair.problem, [chair.extrinsic], [little], chair.lines) < 2.0
 
 
 def test_information_along_a_motion_is_that_of_the_joint_quadratic() -> None:

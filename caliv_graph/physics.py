@@ -18,6 +18,7 @@ from caliv_graph.products import (
     Recording,
     StructureTerm,
     Suspect,
+    VehicleParameter,
 )
 from caliv_graph.targets.cloud.copies import copies
 from caliv_graph.targets.ground.guesses import lidar_grounds, misfits
@@ -245,23 +246,28 @@ def ranked_with(calibration: Calibration, findings: Sequence[Finding]) -> Calibr
         (f for f in findings if f.severity == "contradiction"), key=lambda f: f.sigmas
     )
     found = {_candidate(f.input): f for f in contradicting}
-    raised = [_raised(s, found[s.input]) if s.input in found else s for s in suspects]
+    clock = calibration.vehicle.get("gnss_time_offset")
+    raised = [_raised(s, found[s.input], clock) if s.input in found else s for s in suspects]
     raised.sort(key=lambda s: -s.sigmas if s.input in found else 0.0)
     if raised[0].input in found:
         raised[0] = replace(raised[0], sigmas_left=raised[0].sigmas)
     return replace(calibration, suspects=tuple(raised))
 
 
-def _raised(suspect: Suspect, finding: Finding) -> Suspect:
-    """A suspect with a finding about it; with its value, too, if it is the clock of a LiDAR.
+def _raised(suspect: Suspect, finding: Finding, clock: VehicleParameter | None) -> Suspect:
+    """A suspect with a finding about it; with its value, too, if it is a clock.
 
-    What the graph says of a clock that structure outvotes is no value.
+    What the graph says of a clock of a LiDAR that structure outvotes is no value. Of `clock`, that
+    of the fixes, it says what is left of the finding, from which the smoother begins.
     """
     raised = replace(suspect, sigmas=max(suspect.sigmas, finding.sigmas))
-    if suspect.input.startswith("lidars.") and suspect.input.endswith(".time_offset"):
-        value, sigma = finding.value, (finding.sigma,)
-        return replace(raised, value=value, change=value, sigma=sigma)
-    return raised
+    value, sigma = finding.value, (finding.sigma,)
+    if suspect.input == "gnss.time_offset" and finding.value:
+        if clock is not None:
+            value, sigma = (float(clock.value[0]),), (float(clock.sigma[0]),)
+    elif not (suspect.input.startswith("lidars.") and suspect.input.endswith(".time_offset")):
+        return raised
+    return replace(raised, value=value, change=value, sigma=sigma)
 
 
 def _candidate(key: str) -> str:

@@ -98,6 +98,21 @@ def test_an_input_that_a_finding_contradicts_leads_where_no_score_does() -> None
     assert ranked_with(culprit, [finding(6.0)]) is culprit
 
 
+def test_a_clock_of_the_fixes_that_is_far_off_has_the_value_of_the_solve() -> None:
+    # The smoother begins at 0.48 s, from where the graph has the rest.
+    rest, height = suspect("gnss.time_offset", 0.9), suspect("ground.vehicle_height", 2.0)
+    vehicle = {"gnss_time_offset": VehicleParameter(np.array([0.4994]), np.array([9e-4]), (True,))}
+    calm = replace(make_calibration(), suspects=(height, rest), vehicle=vehicle)
+    found = Finding("topics.gnss", (0.48,), 0.012, 40.0, "contradiction", "late")
+
+    first, second = ranked_with(calm, [found]).suspects
+
+    assert (first.input, first.sigmas, second) == ("gnss.time_offset", 40.0, height)
+    assert (first.value, first.change, first.sigma) == ((0.4994,), (0.4994,), (9e-4,))
+    (exact, _) = ranked_with(replace(calm, vehicle={}), [found]).suspects
+    assert (exact.value, exact.sigma) == ((0.48,), (0.012,))
+
+
 def term(**clocks: tuple[float, float]) -> StructureTerm:
     nothing = np.zeros(0)
     return StructureTerm(

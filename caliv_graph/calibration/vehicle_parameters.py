@@ -17,7 +17,6 @@ from caliv_graph.calibration.heave import with_heave
 from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import (
-    NANOSECONDS_PER_SECOND,
     key_imu_place,
     key_imu_rotation,
     key_lever_arm,
@@ -80,7 +79,7 @@ CLOCKS = {
     IMU_TIME_OFFSET.name: IMU_CLOCK,
     WHEELS_TIME_OFFSET.name: IMU_CLOCK,
 }
-"""Parameters that are the time offset of a sensor -> its clock in `SmootherInput.late_ns`."""
+"""Parameters that are the time offset of a sensor -> its clock in `SmootherInput.late_s`."""
 
 USUAL_LATE_S = 0.02
 """1 sigma of the stamps of a sensor whose messages are stamped when they arrive."""
@@ -294,7 +293,7 @@ def _value(trajectory: SmoothedTrajectory, name: str) -> ParameterValue:
     if name == IMU_PLACE.name:
         return np.asarray(trajectory.data.T_vehicle_imu.translation())
     if name in CLOCKS:
-        return np.array([trajectory.data.late_ns.get(CLOCKS[name], 0) / NANOSECONDS_PER_SECOND])
+        return np.array([trajectory.data.late_s(CLOCKS[name])])
     return trajectory.data.T_vehicle_imu.rotation()
 
 

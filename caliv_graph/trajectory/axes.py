@@ -18,9 +18,14 @@ MIN_ACCELERATION_M_S2 = 0.15
 """Root mean square of the horizontal acceleration from which axes can be compared: that of a slope
 of 1 degree."""
 
-MAX_DELAY_S = 1.0
-DELAY_STEP_S = 0.05
-"""Clock offsets that are tried. A larger one is a different clock, which the readers report."""
+MAX_DELAY_S = 3.0
+DELAY_STEP_S, COARSE_STEPS = 0.05, 4
+"""Clock offsets that are tried: every fourth, then those about the best. Accelerations are means
+over 2 s, so that their agreement changes slowly with the offset."""
+
+MIN_DELAY_S = 0.05
+"""Smaller clock offsets are left to the smoother: parabolas over 2 s err by some hundredths of a
+second on sound drives, and their sigma may be less."""
 
 SLOPE_PRIOR_M_S2 = 0.35
 """1 sigma of gravity's part along a slope of 2 degrees, and of the accelerometer's bias: what the
@@ -47,6 +52,7 @@ class Axes:
         ratio: of the measured to the true acceleration, with its sigma.
         mirrored: whether left and right are exchanged: axes that are left-handed.
         delay_s: of the GNSS stamps against those of the IMU, with its sigma; None: not determined.
+            Where it is certain, all else is at stamps that are free of it.
     """
 
     yaw_rad: float
@@ -54,6 +60,15 @@ class Axes:
     ratio: tuple[float, float]
     mirrored: bool
     delay_s: tuple[float, float] | None
+
+    @property
+    def certain_delay_s(self) -> tuple[float, float] | None:
+        """The same where it is beyond doubt, and large enough to bend a trajectory."""
+        return self.delay_s if _is_certain(self.delay_s) else None
+
+
+def _is_certain(delay_s: tuple[float, float] | None) -> bool:
+    return delay_s is not None and abs(delay_s[0]) > max(MIN_DELAY_S, SIGMAS * delay_s[1])
 
 
 def _directions(motion: MotionData, moving: Windows) -> Array:
@@ -100,14 +115,28 @@ def accelerometer_axes(
     plain, mirror = fit(0.0), fit(0.0, mirrored=True)
     if plain is None or mirror is None:
         return None
-    delays = np.arange(-MAX_DELAY_S, MAX_DELAY_S + 1e-9, DELAY_STEP_S)
-    fits = [fit(delay_s) for delay_s in delays.tolist()]
-    scatter = np.array([math.inf if f is None else f.squares / f.dof for f in fits])
-    variance = min(float(scatter.min()), mirror.squares / mirror.dof)
-    delay = _minimum(delays, scatter * plain.dof / variance)
+
+    def scatter(step: int) -> float:
+        found = fit(step * DELAY_STEP_S)
+        return math.inf if found is None else found.squares / found.dof
+
+    most = round(MAX_DELAY_S / DELAY_STEP_S)
+    steps = np.arange(-most, most + 1, COARSE_STEPS)
+    coarse = np.array([scatter(step) for step in steps.tolist()])
+    near = int(steps[np.argmin(coarse)])
+    fine = np.arange(near - COARSE_STEPS - 1, near + COARSE_STEPS + 2)
+    by_step = np.array([scatter(step) for step in fine.tolist()])
+    least = float(by_step.min())
+    variance = min(least, mirror.squares / mirror.dof)
+    delay = None
+    if abs(near) < most and is_alone(coarse * plain.dof / variance):
+        at = np.asarray(fine * DELAY_STEP_S, np.float64)
+        delay = _minimum(at, by_step * plain.dof / variance)
     better = (plain.squares - mirror.squares) / variance
-    mirrored = better > SIGMAS**2 and mirror.squares < plain.dof * float(scatter.min())
+    mirrored = better > SIGMAS**2 and mirror.squares < plain.dof * least
     chosen = mirror if mirrored else plain
+    if not mirrored and delay is not None and _is_certain(delay):
+        chosen = fit(delay[0]) or plain
     size = math.hypot(*chosen.factor)
     if size < SIGMAS * math.sqrt(float(np.linalg.eigvalsh(chosen.cov)[-1])):
         return None
@@ -165,6 +194,17 @@ def _regression(force: Complex, acceleration: Complex, along: Complex, swing: Co
     squares = float(left @ left) / OVERLAP + float(found @ prior @ found)
     cov = variance * np.linalg.pinv(normal + prior)
     return _Fit(found[:2], np.asarray(cov[:2, :2]), squares, dof)
+
+
+def is_alone(chi2: Array) -> bool:
+    """Whether no other local minimum of chi-squares is within `SIGMAS` of the lowest.
+
+    A drive that does the same again after seconds tells its clock up to these.
+    """
+    padded = np.concatenate([[math.inf], chi2, [math.inf]])
+    local = (chi2 <= padded[:-2]) & (chi2 <= padded[2:])
+    local[np.argmin(chi2)] = False
+    return not bool((chi2[local] < chi2.min() + SIGMAS**2).any())
 
 
 def _minimum(at: Array, chi2: Array) -> tuple[float, float] | None:

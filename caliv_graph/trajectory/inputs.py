@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.model import Config
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, ImuSamples, MotionData
 from caliv_graph.trajectory.antennas import Baselines, Headings, directions_of
@@ -79,6 +80,9 @@ class SmootherInput:
         second_arm: (3,) the second antenna in the vehicle frame, metres.
         late_ns: sensor (`IMU_CLOCK`, `GNSS_CLOCK`) -> stamps less true times in the clock of the
             LiDARs; absent: 0. Stamps of `inertial` are free of it, all others as they were read.
+        found_late_s: how late the fixes are and its sigma, found before smoothing
+            (`late_fixes.py`). Stamps of positions, headings and baselines are free of it, and
+            `late_ns` is beyond it. None: nothing says that they are late.
         slow_orientation_rad: 1 sigma of errors of the orientations at a node beside their noise,
             which hardly change from node to node.
     """
@@ -106,7 +110,13 @@ class SmootherInput:
     heading_yaw: float = 0.0
     second_arm: Array = field(default_factory=lambda: np.zeros(3))
     late_ns: Mapping[str, int] = field(default_factory=dict)
+    found_late_s: tuple[float, float] | None = None
     slow_orientation_rad: float = 0.0
+
+    def late_s(self, clock: str) -> float:
+        """Stamps of a sensor as they were read less true times, seconds."""
+        found_s = self.found_late_s[0] if clock == GNSS_CLOCK and self.found_late_s else 0.0
+        return found_s + self.late_ns.get(clock, 0) / NANOSECONDS_PER_SECOND
 
     @property
     def heading_imu(self) -> Array:

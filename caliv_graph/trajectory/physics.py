@@ -7,12 +7,13 @@ are in `wording.physics`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caliv_graph.config.heading import HeadingAxes
 from caliv_graph.config.model import Config
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import (
     Array,
     BoolArray,
@@ -162,15 +163,25 @@ def motion_physics(motion: MotionData, config: Config) -> MotionPhysics | None:
     if windows is None:
         return MotionPhysics(motion.name, gravity, tuple(ratios))
     moving = windows.where(windows.speed_m_s > MIN_SPEED_M_S)
+    axes = accelerometer_axes(moving, inertial, motion, R_vehicle_imu, config)
+    moving = _at_true_times(moving, axes)
     by_course = _gyro_by_course(moving, inertial, turn, config)
     if by_course is not None:
         ratios.insert(0, by_course)
     speed = _speed(motion, moving)
-    axes = accelerometer_axes(moving, inertial, motion, R_vehicle_imu, config)
     heading = _heading_by_course(motion, moving, config)
     return MotionPhysics(
         motion.name, gravity, tuple(ratios), speed, axes, heading=heading, oriented=oriented
     )
+
+
+def _at_true_times(moving: Windows, axes: Axes | None) -> Windows:
+    """Windows of fixes whose clock is certainly off, in the clock of the IMU."""
+    delay = None if axes is None else axes.certain_delay_s
+    if delay is None:
+        return moving
+    by_ns = round(delay[0] * NANOSECONDS_PER_SECOND)
+    return replace(moving, stamps_ns=moving.stamps_ns - by_ns)
 
 
 def _wheel_physics(motion: MotionData, twist: TwistSamples, config: Config) -> MotionPhysics | None:

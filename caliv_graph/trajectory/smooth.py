@@ -24,7 +24,8 @@ from caliv_graph.trajectory.correlated_step import (
 )
 from caliv_graph.trajectory.initial import first_states
 from caliv_graph.trajectory.initial_wheels import first_wheel_states
-from caliv_graph.trajectory.inputs import SmootherInput, check_input, noise_sources, scaled
+from caliv_graph.trajectory.inputs import SmootherInput, noise_sources, scaled
+from caliv_graph.trajectory.late_fixes import smoother_input
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
@@ -72,7 +73,7 @@ def smooth_trajectory(
     Raises:
         TrajectoryError: what was recorded does not determine the motion; says what is missing.
     """
-    data, warnings = check_input(motion, config)
+    data, warnings = smoother_input(motion, config)
     data = scaled(data, scales or {})
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)

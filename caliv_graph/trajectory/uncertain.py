@@ -157,15 +157,20 @@ def _clocks(data: SmootherInput) -> list[UncertainParameter]:
     if not config.solve.time_offset:
         inertial = config.imu if data.wheels is None else config.wheels
         sigmas.append((inertial_time_offset(data), inertial.time_offset_sigma_s))
-    if data.positions is not None:
+    late = data.found_late_s
+    if data.positions is not None and late is None:
         sigmas.append((GNSS_TIME_OFFSET, config.gnss.time_offset_sigma_s))
-    return [
+    out = [
         UncertainParameter(
             parameter, np.full(1, min(sigma_s, SYNCHRONISED_S)), np.zeros(1), np.full(1, sigma_s)
         )
         for parameter, sigma_s in sigmas
         if sigma_s
     ]
+    if data.positions is not None and late is not None:  # free from the start, about that
+        sigma = np.full(1, np.hypot(late[1], config.gnss.time_offset_sigma_s))
+        out.append(UncertainParameter(GNSS_TIME_OFFSET, sigma, np.zeros(1)))
+    return out
 
 
 def are_wide(parameters: Sequence[UncertainParameter]) -> bool:
@@ -242,6 +247,8 @@ def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
     at, out = 0, list(settled.parameters)
     for i, p in enumerate(out):
         if p.parameter is GNSS_TIME_OFFSET:
+            if p.beside_lidars is None:  # it is free
+                return None
             assert p.sigmas is not None
             assert p.offset is not None
             variance = settled.cov[at, at]
@@ -252,7 +259,6 @@ def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
                 return None
             # So late is no clock that is merely not synchronised: an antenna a metre from where it
             # was typed to be swings in curves like one. The ranking of suspects tells which it is.
-            assert p.beside_lidars is not None
             if abs(pull) > MOST_LATE_SIGMAS * p.beside_lidars[0] * told:
                 return None
             out[i] = replace(p, sigmas=p.beside_lidars)

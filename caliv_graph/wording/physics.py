@@ -60,7 +60,7 @@ SMALL_RATIO = 0.05
 """A smaller one is not said: the scale error of a cheap gyroscope, or of a worn tyre."""
 
 MIN_DELAY_S = 0.1
-"""A smaller clock offset is left to the solve: parabolas over 2 s do not resolve it safely."""
+"""A smaller clock offset is said by the solve, which knows it better."""
 
 SAID_TO_FOLLOW = 0.5
 """Part of a deviation from the course that another reading of poses may leave, to be said with it.
@@ -346,19 +346,22 @@ def _axes(name: str, axes: Axes, config: Config, told: bool) -> Iterator[Finding
             f"{math.degrees(axes.sigma_rad):.0f} degrees of yaw against the accelerations of the "
             f"path: imu.T_vehicle_imu rpy_deg about {_rpy(value)} would fit{unless}",
         )
-    if axes.delay_s is not None:
-        delay_s, sigma_s = axes.delay_s
-        if abs(delay_s) > max(MIN_DELAY_S, CONTRADICTION_SIGMAS * sigma_s):
-            way = "late" if delay_s > 0.0 else "early"
-            yield Finding(
-                "topics.gnss",
-                (delay_s,),
-                sigma_s,
-                abs(delay_s) / sigma_s,
-                "contradiction",
-                f"{name}: the stamps of the GNSS are {abs(delay_s):.2f} +- {sigma_s:.2f} s {way} "
-                "against those of the IMU, by the accelerations of both: correct its clock",
-            )
+    delay = axes.certain_delay_s
+    most_s = max(MIN_DELAY_S, CONTRADICTION_SIGMAS * config.gnss.time_offset_sigma_s)
+    if delay is not None and abs(delay[0]) > most_s:
+        delay_s, sigma_s = delay
+        way = "late" if delay_s > 0.0 else "early"
+        yield Finding(
+            "topics.gnss",
+            (delay_s,),
+            sigma_s,
+            abs(delay_s) / sigma_s,
+            "contradiction",
+            f"{name}: the stamps of the GNSS are {abs(delay_s):.2f} +- {sigma_s:.2f} s {way} "
+            "against those of the IMU, by the accelerations of both: correct its clock, or set "
+            "gnss.time_offset_sigma_s to as much. If clocks of LiDARs seem wrong as well, that of "
+            "the IMU is",
+        )
 
 
 _READINGS = {

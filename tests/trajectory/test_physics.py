@@ -13,6 +13,7 @@ import pytest
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.physics import raise_fatal, raw_findings
 from caliv_graph.products import Array, Finding, MotionData
+from caliv_graph.trajectory.axes import SIGMAS, is_alone
 from caliv_graph.trajectory.physics import motion_physics
 from tests.trajectory.motions import (
     Course,
@@ -200,15 +201,35 @@ def test_without_orientations_axes_that_are_turned_leave_nothing_to_smooth(
         assert (turned.severity, unless in turned.sentence) == (expected, True)
 
 
-@pytest.mark.parametrize("late_s", [0.3, -0.2])
+def late(motion: MotionData, late_s: float) -> MotionData:
+    assert motion.gnss is not None
+    stamps = motion.gnss.stamps_ns + round(1e9 * late_s)
+    return replace(motion, gnss=replace(motion.gnss, stamps_ns=stamps))
+
+
+@pytest.mark.parametrize("late_s", [0.3, -0.2, 2.0, -1.0])
 def test_a_late_gnss_clock_is_named_in_its_own_seconds(late_s: float) -> None:
     for seed in SEEDS:
-        motion = recorded(EIGHT, seed)
-        assert motion.gnss is not None
-        stamps = motion.gnss.stamps_ns + round(1e9 * late_s)
-        (found,) = found_in(replace(motion, gnss=replace(motion.gnss, stamps_ns=stamps)))
-        assert found.input == "topics.gnss"
+        # Nothing else is: gyroscope, speeds and axes are compared at the true times.
+        (found,) = found_in(late(recorded(EIGHT, seed), late_s))
+        assert (found.input, found.severity) == ("topics.gnss", "contradiction")
         assert found.value[0] == pytest.approx(late_s, abs=5.0 * found.sigma)
+        assert "or set gnss.time_offset_sigma_s to as much" in found.sentence
+
+
+def test_a_late_gnss_clock_that_the_config_allows_for_is_no_finding() -> None:
+    # As the sentence says.
+    motion = late(recorded(EIGHT, 0), 0.5)
+    assert found_in(motion, gnss={"time_offset_sigma_s": 0.5}) == ()
+    assert found_in(motion, gnss={"time_offset_sigma_s": 0.05}) != ()
+
+
+def test_a_clock_that_two_offsets_fit_is_not_told() -> None:
+    one = np.array([90.0, 40.0, 12.0, 60.0, 80.0])
+    assert is_alone(one)
+    assert is_alone(np.array([*one, 12.0 + SIGMAS**2, 70.0]))
+    assert not is_alone(np.array([*one, 11.0 + SIGMAS**2, 70.0]))
+    assert not is_alone(np.array([30.0, *one]))  # the best may lie beyond the end
 
 
 def test_a_wrong_lever_arm_is_no_clock() -> None:

@@ -36,6 +36,7 @@ from tests.trajectory.motions import (
 COURSE = Course(eight_drive(24.0), rough=1.0)
 SENSORS = replace(mounted_askew(), imu_hz=50.0, twist_hz=20.0, twist_delay_s=0.017)
 WANTED = stamps(24.0, 2.0, 0.0512)
+ARM: dict[str, object] = {"lever_arm": list(SENSORS.lever_arm), "lever_arm_sigma": 1e-7}
 
 
 def marginals(smoothed: SmoothedTrajectory) -> Array:
@@ -270,3 +271,28 @@ def test_a_rough_lever_arm_and_a_slow_error_of_the_fixes_are_in_one_gaussian() -
     assert np.abs(joint.gradient / np.sqrt(np.diag(joint.information))).max() < 0.02
     sigma = np.sqrt(np.diagonal(smoothed.trajectory.cov, axis1=1, axis2=2))
     assert (sigma[:, 3:] > 0.025).all()
+
+
+@pytest.mark.parametrize("late_s", [0.5, -1.0])
+def test_fixes_whose_clock_is_far_off_lead_to_the_right_trajectory(late_s: float) -> None:
+    motion = record(COURSE, SENSORS, 3)
+    assert motion.gnss is not None
+    stamps = motion.gnss.stamps_ns + round(1e9 * late_s)
+    late = replace(motion, gnss=replace(motion.gnss, stamps_ns=stamps))
+    # Of the usual prior, which 0.1 s would contradict.
+    config = config_for(SENSORS, gnss={"time_offset_sigma_s": 0.02, **ARM})
+
+    smoothed = smooth_trajectory(late, config, WANTED)
+
+    (clock,) = (p for p in smoothed.parameters if p.parameter.name == "gnss.time_offset")
+    # Free about what accelerations say, so that the calibration knows what is left of it.
+    assert clock.sigmas is not None
+    assert smoothed.data.found_late_s is not None
+    assert clock.sigmas[0] == math.hypot(smoothed.data.found_late_s[1], 0.02)
+    assert clock.sigmas[0] < 0.06
+    (sigma_s,) = smoothed.sigmas_of("gnss.time_offset") or (math.nan,)
+    assert smoothed.data.late_s("gnss") == pytest.approx(late_s, abs=4.0 * sigma_s)
+    assert sigma_s < 0.01
+    assert len(smoothed.gnss_rejected) == 0
+    assert not [w for w in smoothed.warnings if "noise.gnss" in w]
+    assert nees(late, smoothed) < 16.0

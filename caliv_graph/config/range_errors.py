@@ -170,20 +170,19 @@ def size_weights(
 
     Args:
         information: (B, B) of the errors, everything else eliminated, without their own priors.
-            With one prior of sizes it need not be symmetric and positive to the last digit.
+            It need not be symmetric to the last digit, nor positive for the kind with the most.
         pull: (B,) minus the gradient of the negative logarithm of the likelihood, at no errors.
         kinds: (B,) index of the prior that each error's size has.
         priors: of the sizes.
     """
-    if len(priors) == 1:
-        return _weights(_costs(information, pull, priors[0].sigmas) + priors[0].cost)
+    information = 0.5 * (information + information.T)
     # The kind with the most errors is integrated out on its own axes, at each of its sizes. What
     # is left is small.
     most = int(np.argmax(np.bincount(kinds, minlength=len(priors))))
     rest = [k for k in range(len(priors)) if k != most]
     grids = np.meshgrid(*(priors[k].sigmas for k in rest), indexing="ij")
     few, many = np.flatnonzero(kinds != most), np.flatnonzero(kinds == most)
-    sizes = np.stack(grids, axis=-1)[..., np.searchsorted(rest, kinds[few])]
+    sizes = np.stack(grids, axis=-1)[..., np.searchsorted(rest, kinds[few])] if rest else np.ones(0)
     values, axes = np.linalg.eigh(information[np.ix_(many, many)])
     values = np.maximum(values, 0.0)
     common, pulled = axes.T @ information[np.ix_(many, few)], axes.T @ pull[many]
@@ -197,22 +196,8 @@ def size_weights(
     cost = np.moveaxis(np.array(costs), 0, most)
     for k, prior in enumerate(priors):
         cost += prior.cost.reshape([-1 if axis == k else 1 for axis in range(len(priors))])
-    return _weights(cost)
-
-
-def _weights(cost: Array) -> Array:
-    """Probabilities from minus their logarithms, up to a constant."""
     weights = np.exp(cost.min() - cost)
     return np.asarray(weights / weights.sum())
-
-
-def _costs(information: Array, pull: Array, sigmas: Array) -> Array:
-    """(n,) `_costs_of` errors that have one sigma, at each of some (n,)."""
-    values, axes = np.linalg.eigh(0.5 * (information + information.T))
-    values = np.maximum(values, 0.0)
-    variances = sigmas[:, None] ** 2
-    known = 1.0 + variances * values
-    return np.asarray(0.5 * (np.log(known) - variances * (axes.T @ pull) ** 2 / known).sum(axis=1))
 
 
 def _costs_of(information: Array, pull: Array, sigmas: Array) -> Array:

@@ -18,15 +18,12 @@ from caliv_graph.targets.cloud.constellation import match_objects, one_object, s
 from caliv_graph.targets.cloud.moved import CandidateCentres, periods
 from caliv_graph.targets.cloud.region import OUTSIDE_M, Candidate, RegionExtractor
 from caliv_graph.targets.cloud.scans import ScanOrder, scans_to_decode
-from caliv_graph.targets.cloud.tally import Tally
+from caliv_graph.targets.cloud.tally import OTHER_REGION, Tally
 from caliv_graph.targets.cloud.views import clouds_per_lidar
 from caliv_graph.targets.search import FoundTarget, find_target
 from caliv_graph.trajectory.select import VehicleTrajectory
 
-REMEDY = (
-    "Move or widen target.min/max, or leave target out: it is then searched for; or check the "
-    "initial guesses: run 'caliv-graph inspect' with the config"
-)
+REMEDY = f"{OTHER_REGION}; or check the initial guesses: run 'caliv-graph inspect' with the config"
 
 SCANS_OF_A_PLACE = 10
 """Scans of each place of a target that is moved while the vehicle stands. All show the same spots

@@ -13,6 +13,9 @@ NOTHING = "nothing above the ground that is 0.2 to 2 m wide"
 MOVED = "something else stood there"
 EMPTY = "empty within the range limits"
 
+OTHER_REGION = "Move or widen target.min/max, or leave target out: it is then searched for"
+"""Remedy for a region with no target in it."""
+
 FEWEST_POINTS = 6
 """Smallest value of `extraction.min_points`."""
 
@@ -67,10 +70,7 @@ class Tally:
         if worst.startswith("under "):
             return "Pass the target more slowly, or nearer, on the side that this LiDAR sees"
         if is_given:
-            return (
-                "Move or widen target.min/max, or leave target out: it is then searched for; "
-                "'caliv-graph inspect' shows who sees it when"
-            )
+            return f"{OTHER_REGION}; 'caliv-graph inspect' shows who sees it when"
         return (
             "Check its initial guess, and drive so that it passes the target; 'caliv-graph "
             "inspect' shows who sees it when"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -21,6 +21,7 @@ from caliv_graph.calibration.linear import cloud_rows
 from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.config.range_errors import (
     OFFSETS_M,
+    SizePrior,
     flat,
     incidence_prior,
     log_normal,
@@ -28,10 +29,11 @@ from caliv_graph.config.range_errors import (
     size_weights,
 )
 from caliv_graph.geometry.quadratic import without_errors
-from caliv_graph.geometry.se3 import cross, skew
-from caliv_graph.products import Array
+from caliv_graph.geometry.se3 import skew
+from caliv_graph.products import Array, IntArray
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.heights import LEAST_SIGMA_M
+from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import JointRegistration
 
 TYPICAL_SMOOTH = 0.5
@@ -45,13 +47,17 @@ VIEW_RAD = math.radians(20.0)
 """Angle between views, about the target, at which their smooth errors are alike by e^-1/2: what
 depends on incidence changes by a third from 30 to 50 degrees."""
 
-HARDLY_SHOWN = 1e-3
+HARDLY_SHOWN = 1e-6
 """Ridge, relative to what a cloud's faces show of its motion in all directions: a cloud of one face
-does not seem to slide along it or to turn in it."""
+does not seem to slide along it or to turn in it. Grazing faces count up to 400 times as much as
+others, which have to count beside them."""
 
 RANK_PART = 1e-4
 """Eigenvectors of the correlation of views with less than this part of the largest eigenvalue are
 left out: numerical."""
+
+PASSES = 2
+"""Times that the size of each LiDAR is found beside those of the others."""
 
 SURE = 0.99
 """Probability with which the offsets are at least `BiasSizes.least_m`."""
@@ -65,13 +71,14 @@ class BiasSizes:
         offset_m: of each LiDAR on each target, metres.
         smooth: of the smooth errors, over the roughness.
         least_m: the offsets' is at least this, by the data, metres (`SURE`).
-        incidence_m: of the growth with 1 / cos(incidence), of each LiDAR on each target, metres.
+        incidence_m: (2 B,) of the growths with the incidence, of each LiDAR on each target, metres;
+            one number: of all.
     """
 
     offset_m: float
     smooth: float
     least_m: float = 0.0
-    incidence_m: float = 0.0
+    incidence_m: tuple[float, ...] = (0.0,)
 
 
 UNKNOWN = BiasSizes(float(OFFSETS_M[0]), 0.0)
@@ -84,17 +91,19 @@ class RangeBiases:
 
     Attributes:
         offsets: (6 J, B) by a metre of the offset of each LiDAR and placement.
-        incidence: (6 J, B) by a metre per 1 / cos(incidence) - 1, of the same.
+        incidence: (6 J, 2 B) by a metre of each growth with the incidence, of the same.
+        lidar: (2 B,) index of the LiDAR that each of these is of, over all placements.
         smooth: (6 J, C) by smooth errors of the size of the roughness, as independent ones.
     """
 
     offsets: Array
     incidence: Array
+    lidar: IntArray
     smooth: Array
 
     def directions(self, sizes: BiasSizes) -> Array:
-        """(6 J, 2 B + C) by biases of sigma 1."""
-        of_lidars = [sizes.offset_m * self.offsets, sizes.incidence_m * self.incidence]
+        """(6 J, 3 B + C) by biases of sigma 1."""
+        of_lidars = [sizes.offset_m * self.offsets, np.array(sizes.incidence_m) * self.incidence]
         return np.hstack([*of_lidars, sizes.smooth * self.smooth])
 
 
@@ -102,18 +111,15 @@ class RangeBiases:
 class OwnRanges:
     """How biases of its ranges seem to move each of J clouds, in the frame of its LiDAR.
 
-    The same at all poses, while the normals of the points stay.
+    The same at all poses.
 
     Attributes:
         beams: (J, 3) mean of the unit vectors.
         radii: (J,) per axis at right angles to these: root mean square distance to the middle.
-        incidence: (J, 6) turn about the middle and motion of it by a metre per
-            1 / cos(incidence) - 1.
     """
 
     beams: Array
     radii: Array
-    incidence: Array
 
     @classmethod
     def of(cls, clouds: CloudStack) -> OwnRanges:
@@ -124,28 +130,37 @@ class OwnRanges:
         across = clouds.centred - along[:, None] * views[clouds.cloud]
         # An error of its size there, in the root mean square.
         radii = np.sqrt(0.5 * clouds.sum_per_cloud((across**2).sum(axis=1)) / clouds.sizes)
-        return cls(beams, radii, _by_incidence(clouds))
+        return cls(beams, radii)
 
 
 def range_biases(
     states: Sequence[JointRegistration],
     poses: Sequence[tuple[Array, Array]],
+    quadratics: Sequence[ShapeQuadratic],
     own: Sequence[OwnRanges] | None = None,
 ) -> RangeBiases:
-    """Of all placements, at `T_target_lidar` (J, 3, 3), (J, 3) of each.
+    """Of all placements, at `T_target_lidar` (J, 3, 3), (J, 3) of each, and the quadratic there.
 
     `own` is `OwnRanges` of each, for many poses.
     """
     own = [OwnRanges.of(state.clouds) for state in states] if own is None else own
-    each = zip(states, poses, own, strict=True)
-    both = [_of_placement(state, R, t, ranges) for state, (R, t), ranges in each]
-    return RangeBiases(
-        *(np.asarray(scipy.linalg.block_diag(*kind)) for kind in zip(*both, strict=True))
-    )
+    each = zip(states, poses, quadratics, own, strict=True)
+    both = [_of_placement(state, R, t, of, ranges) for state, (R, t), of, ranges in each]
+    offsets, incidence, smooth = (scipy.linalg.block_diag(*of) for of in zip(*both, strict=True))
+    names = [name for state in states for name in _lidars_of(state)]
+    index = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    lidar = np.repeat([index[name] for name in names], 2)
+    return RangeBiases(offsets, incidence, lidar, smooth)
+
+
+def _lidars_of(state: JointRegistration) -> list[str]:
+    """The LiDARs of a placement, in the order of their columns."""
+    _, first = np.unique(state.clouds.lidar, return_index=True)
+    return [state.observation.clouds[j].lidar for j in first.tolist()]
 
 
 def _of_placement(
-    state: JointRegistration, R: Array, t: Array, ranges: OwnRanges
+    state: JointRegistration, R: Array, t: Array, quadratic: ShapeQuadratic, ranges: OwnRanges
 ) -> tuple[Array, Array, Array]:
     """`RangeBiases.offsets`, `.incidence` and `.smooth` of a placement."""
     clouds = state.clouds
@@ -155,10 +170,8 @@ def _of_placement(
     offsets[each, 3:, clouds.lidar] = beams
     views = beams / np.linalg.norm(beams, axis=1)[:, None]
     middles = _turned(R, clouds.centres) + t
-    incidence = np.zeros((clouds.count, 6, clouds.lidars))
-    turn = _turned(R, ranges.incidence[:, :3])
-    incidence[each, :3, clouds.lidar] = turn
-    incidence[each, 3:, clouds.lidar] = _turned(R, ranges.incidence[:, 3:]) + cross(middles, turn)
+    incidence = np.zeros((clouds.count, 6, clouds.lidars, 2))
+    incidence[each, :, clouds.lidar] = _by_incidence(quadratic)
     roughness = np.sqrt(np.maximum(state.noise.roughness_m2 - LEAST_SIGMA_M**2, 0.0))
     smooth = [np.zeros((clouds.count, 6, 0))]
     for a in np.flatnonzero(roughness > 0.0).tolist():
@@ -182,27 +195,17 @@ def _turned(R: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("jab,jb->ja", R, vectors))
 
 
-def _by_incidence(clouds: CloudStack) -> Array:
-    """`OwnRanges.incidence`.
+def _by_incidence(quadratic: ShapeQuadratic) -> Array:
+    """(J, 6, 2) motion of each cloud that growths of its ranges by a metre seem to be.
 
-    A range that is too long by that puts its point `1 - cos(incidence)` behind the surface. The
-    motion that explains this best, over all points whose normals are reliable.
+    The one that fits best by the weights of the registration, given the shape: what a cloud shows
+    of its motion is what such ranges move.
     """
-    normals, own, apart = clouds.normals, clouds.cloud, clouds.centred
-    facing = -np.einsum("na,na->n", normals, clouds.beams)
-    behind = -(1.0 - np.clip(facing, 0.0, 1.0))
-    radii = np.sqrt(clouds.sum_per_cloud((apart**2).sum(axis=1)) / clouds.sizes)
-    radii = np.maximum(radii, LEAST_SIGMA_M)[:, None]
-    # Turns in units of the displacement that they are at the radius.
-    J = np.hstack([cross(apart, normals) / radii[own], normals])
-    weighted = clouds.flatness[:, None] * J
-    shown = clouds.sum_per_cloud((weighted[:, :, None] * J[:, None]).reshape(-1, 36))
-    shown = shown.reshape(-1, 6, 6)
-    ridge = HARDLY_SHOWN * np.trace(shown, axis1=1, axis2=2) + 1e-9
-    shown += ridge[:, None, None] * np.eye(6)
-    sums = clouds.sum_per_cloud(weighted * behind[:, None])
-    motion = np.linalg.solve(shown, sums[..., None])[..., 0]
-    return np.hstack([motion[:, :3] / radii, motion[:, 3:]])
+    blocks = quadratic.blocks
+    ridge = HARDLY_SHOWN * np.trace(blocks, axis1=1, axis2=2) + 1e-9
+    return np.asarray(
+        np.linalg.solve(blocks + ridge[:, None, None] * np.eye(6), quadratic.incidence)
+    )
 
 
 def _root_of_views(views: Array) -> Array:
@@ -263,7 +266,9 @@ def fit_bias_sizes(
     """The sigmas of the biases: root mean squares of their posterior.
 
     By the restricted likelihood: extrinsics, poses, targets and shape are integrated out, so that a
-    bias that a mounting can make up for says nothing.
+    bias that a mounting can make up for says nothing. What the offsets of two LiDARs are drawn from
+    is one data sheet's accuracy. How an echo at a slant is timed is of each model: the growth of
+    each LiDAR has a size of its own, or one that grows would hide among those that do not.
 
     Args:
         reduced: the linearised problem with the clouds' quadratic, no bias eliminated.
@@ -273,20 +278,53 @@ def fit_bias_sizes(
     """
     offsets = offset_prior(offset_m)
     incidences = incidence_prior(offset_m)
-    unit = biases.directions(BiasSizes(1.0, 1.0, incidence_m=1.0))
+    unit = biases.directions(BiasSizes(1.0, 1.0, incidence_m=(1.0,)))
     information, pull = _information(reduced, unit, prior)
     smooths = log_normal(SMOOTHS, TYPICAL_SMOOTH) if biases.smooth.shape[1] else flat(np.zeros(1))
     count = biases.offsets.shape[1]
-    kinds = np.repeat([0, 1, 2], [count, count, biases.smooth.shape[1]])
+    kinds = np.repeat([0, 1, 2], [count, biases.incidence.shape[1], biases.smooth.shape[1]])
     weights = size_weights(information, pull, kinds, (offsets, incidences, smooths))
     of_offsets = weights.sum(axis=(1, 2))
     least = int(np.searchsorted(np.cumsum(of_offsets), 1.0 - SURE))
-    return BiasSizes(
+    sizes = BiasSizes(
         offset_m=float(np.sqrt(of_offsets @ offsets.sigmas**2)),
         smooth=float(np.sqrt(weights.sum(axis=(0, 1)) @ smooths.sigmas**2)),
         least_m=float(offsets.sigmas[least]) if offset_m is None else 0.0,
-        incidence_m=float(np.sqrt(weights.sum(axis=(0, 2)) @ incidences.sigmas**2)),
+        incidence_m=(float(np.sqrt(weights.sum(axis=(0, 2)) @ incidences.sigmas**2)),),
     )
+    own_m = _of_each_lidar(information, pull, biases, sizes, incidences)
+    return replace(sizes, incidence_m=tuple(own_m[biases.lidar].tolist()))
+
+
+def _of_each_lidar(
+    information: Array, pull: Array, biases: RangeBiases, sizes: BiasSizes, prior: SizePrior
+) -> Array:
+    """(L,) sizes of the incidence of each LiDAR, those of the others as they are.
+
+    `information` (B, B) and `pull` (B,) are of all biases; `sizes` has one size for all LiDARs.
+    """
+    own_m = np.full(biases.lidar.max(initial=-1) + 1, sizes.incidence_m[0])
+    first = biases.offsets.shape[1]
+    column = np.full(len(pull), -1)
+    column[first : first + len(biases.lidar)] = biases.lidar
+    sigmas = np.repeat(
+        [sizes.offset_m, 0.0, sizes.smooth], [first, len(biases.lidar), biases.smooth.shape[1]]
+    )
+    for _ in range(PASSES):
+        for lidar in range(len(own_m)):
+            sigmas[column >= 0] = own_m[biases.lidar]
+            own, others = np.flatnonzero(column == lidar), np.flatnonzero(column != lidar)
+            across = information[np.ix_(others, own)] * sigmas[others, None]
+            known = np.eye(len(others)) + sigmas[others, None] * (
+                information[np.ix_(others, others)] * sigmas[others]
+            )
+            root = scipy.linalg.cho_factor(known, lower=True)
+            left = information[np.ix_(own, own)] - across.T @ scipy.linalg.cho_solve(root, across)
+            pulled = across.T @ scipy.linalg.cho_solve(root, sigmas[others] * pull[others])
+            kinds = np.zeros(len(own), np.int64)
+            weights = size_weights(left, pull[own] - pulled, kinds, (prior,))
+            own_m[lidar] = math.sqrt(weights @ prior.sigmas**2)
+    return own_m
 
 
 def _information(reduced: Reduced, directions: Array, prior: Array) -> tuple[Array, Array]:

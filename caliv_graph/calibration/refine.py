@@ -436,7 +436,8 @@ def _expect(
         None if turn is None else refit(turn, state.mixture)
         for turn, state in zip(turns, states, strict=True)
     ]
-    return _Shapes(poses, quadratics, fitted, range_biases(states, poses, ranges))
+    biases = range_biases(states, poses, quadratics, ranges)
+    return _Shapes(poses, quadratics, fitted, biases)
 
 
 def per_placement(problem: Problem, lines: CloudLinearisation) -> list[tuple[Array, Array]]:

@@ -28,8 +28,11 @@ OFFSETS_M = np.geomspace(1e-4, 3e-2, 15)
 """Sigmas of the offsets in the integral: from nothing to the largest accuracy of a data sheet."""
 
 INCIDENCES_M = np.geomspace(1e-4, 1e-2, 9)
-"""Sigmas of the growth with 1 / cos(incidence), likewise. Data sheets do not state it, so that all
-sizes are as likely: from nothing to what makes as much as the largest offset at 75 degrees."""
+"""Sigmas of the growth with 1 / cos(incidence), likewise: from nothing to what makes as much as the
+largest offset at 75 degrees."""
+
+TYPICAL_INCIDENCE_M = 1.3e-3
+"""Median of the prior of their sigma. Its root mean square is `INCIDENCE_M`."""
 
 INCIDENCE_M = 3e-3
 """Sigma of the growth with 1 / cos(incidence) where it is not estimated. Data sheets do not state
@@ -156,8 +159,10 @@ def offset_prior(stated_m: float | None) -> SizePrior:
 
 
 def incidence_prior(stated_m: float | None) -> SizePrior:
-    """The prior of the sigma of the growth; at most what is stated of all ranges."""
-    return flat(INCIDENCES_M if stated_m is None else np.minimum(INCIDENCES_M, stated_m))
+    """The prior of the sigma of the growth; of those who state one of all ranges, at most that."""
+    if stated_m is not None:
+        return flat(np.minimum(INCIDENCES_M, stated_m))
+    return log_normal(INCIDENCES_M, TYPICAL_INCIDENCE_M)
 
 
 def size_weights(

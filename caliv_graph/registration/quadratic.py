@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from caliv_graph.common.cores import parts, shared_map
+from caliv_graph.config.range_errors import growth
 from caliv_graph.geometry.se3 import cross, skew, tangent_axes
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack
@@ -31,6 +32,7 @@ from caliv_graph.registration.moments import (
     scatter_about,
     to_target,
 )
+from caliv_graph.registration.surfels import GRAZING
 
 ORIENTATION_PARTS = 2
 """Parts in which the information lost to the components' orientations is summed. The same on any
@@ -61,6 +63,8 @@ class ShapeQuadratic:
 
     Attributes:
         blocks: (J, 6, 6) information of each cloud given the shape.
+        incidence: (J, 6, 2) what `gradient_given_shape` loses by a metre of each growth of the
+            ranges with the incidence (`config/range_errors.py:growth`).
         gradient: (J, 6) g.
         gradient_given_shape: (J, 6) the same where the shape is held: that of `blocks`.
         across: (K', 6 J) roots of the loss to the places of the surfels: across the surface of all,
@@ -79,6 +83,7 @@ class ShapeQuadratic:
     """
 
     blocks: Array
+    incidence: Array
     gradient: Array
     gradient_given_shape: Array
     across: Array
@@ -253,6 +258,7 @@ def shape_quadratic(
     gradient[:, :3] += by_normals @ towards
     quadratic = ShapeQuadratic(
         blocks=blocks,
+        incidence=_by_incidence(points, t, n),
         gradient=gradient,
         gradient_given_shape=given_shape,
         across=_lost(roots, sums),
@@ -296,6 +302,28 @@ def _given_shape(
     gradient[:, :3] += who.levers
     blocks = (np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS
     return blocks.reshape(count, 6, 6), np.asarray(gradient)
+
+
+def _by_incidence(points: Array, t: Array, normals: Array) -> Array:
+    """`ShapeQuadratic.incidence`, of moments of points (J, K, 10), sensors at t and surfels.
+
+    A range that is too long by `growth` puts its point its cosine times that behind the surface.
+    It pulls as any residual does: most where the beams graze, as their noise is along them.
+    """
+    weight, sums = points[..., 0], points[..., 1:4]
+    beams = sums - weight[..., None] * t[:, None]
+    facing = -np.einsum("jka,ka->jk", beams, normals)
+    seen = weight > 0.0
+    away = np.where(seen, np.sqrt(np.einsum("jka,jka->jk", beams, beams)), 1.0)
+    # A normal is not known better than what is taken for grazing.
+    cosine = np.where(seen, np.clip(facing / np.maximum(away, 1e-300), GRAZING, 1.0), 1.0)
+    behind = -cosine * growth(cosine.ravel()).T.reshape(2, *cosine.shape)
+    out = np.empty((len(points), 6, 2))
+    for kind, of_cells in enumerate(behind):
+        moments = np.swapaxes(of_cells[..., None] * sums, 1, 2) @ normals
+        out[:, :3, kind] = moments[:, [1, 2, 0], [2, 0, 1]] - moments[:, [2, 0, 1], [1, 2, 0]]
+        out[:, 3:, kind] = (of_cells * weight) @ normals
+    return out
 
 
 def _lost(roots: Sequence[Array], sums: Sequence[Array]) -> Array:

@@ -39,7 +39,7 @@ from caliv_graph.wording.physics import (
     poses_finding,
     tilt_finding,
 )
-from caliv_graph.wording.suspects import apart_finding, clock_finding
+from caliv_graph.wording.suspects import apart_finding, clock_finding, slip_finding
 
 
 def check_clouds(recordings: Sequence[Recording], config: Config) -> None:
@@ -142,6 +142,20 @@ def clock_findings(
 
     found = min(against(0.0), against(sum(inertial)), key=len)
     return found or _apart(names, terms)
+
+
+def slip_findings(
+    names: Sequence[str], terms: Sequence[StructureTerm], calibration: Calibration
+) -> tuple[Finding, ...]:
+    """Mounts that slip within a drive by its surfaces, if the graph has no culprit.
+
+    `names` are of the drives.
+    """
+    suspects = calibration.suspects
+    if suspects and suspects[0].sigmas > CONTRADICTION_SIGMAS:
+        return ()
+    found = [slip_finding(names[t.drive], t.slip) for t in terms if t.slip is not None]
+    return tuple(finding for finding in found if finding is not None)
 
 
 def without_effects(

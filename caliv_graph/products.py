@@ -460,6 +460,30 @@ class StandingErrors:
 
 
 @dataclass(frozen=True)
+class MountSlip:
+    """A mount that slips once during a drive: what the surfaces around would rather have.
+
+    Attributes:
+        lidars: of one LiDAR; several: all of them move alike.
+        others: LiDARs whose slip would explain as much as that of the first.
+        since_s: seconds from the first scan to the slip.
+        lasts_s: seconds from the first scan to the last.
+        change: (6,) by which the LiDAR is turned (rad) and shifted (m) by it, vehicle axes, about
+            its own origin; several, about that of the vehicle.
+        sigmas: how significant it is, an allowance included, of a normal variable.
+        alone: there is no other LiDAR, which would tell it from what turns the motion data.
+    """
+
+    lidars: tuple[str, ...]
+    others: tuple[str, ...]
+    since_s: float
+    lasts_s: float
+    change: Array
+    sigmas: float
+    alone: bool = False
+
+
+@dataclass(frozen=True)
 class StructureTerm:
     """What the structure of one drive says; its planes and all other poses are eliminated.
 
@@ -495,6 +519,7 @@ class StructureTerm:
         clocks_apart: two of these -> how much later the stamps of the second are, and 1 sigma.
         channels: LiDAR -> 1 sigma of the errors of one of its channels, estimated: range (m),
             elevation and azimuth (rad).
+        slip: the slip of a mount that these surfaces would rather have; None: not tested.
     """
 
     drive: int
@@ -516,6 +541,7 @@ class StructureTerm:
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     clocks_apart: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     channels: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    slip: MountSlip | None = None
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from caliv_graph.physics import (
     contradictions_of,
     raise_fatal,
     ranked_with,
+    slip_findings,
     smoothed_findings,
     warnings_of,
     with_cause,
@@ -27,6 +28,7 @@ from caliv_graph.physics import (
 from caliv_graph.products import (
     Finding,
     MotionData,
+    MountSlip,
     Recording,
     StructureTerm,
     Suspect,
@@ -161,6 +163,21 @@ def test_a_clock_that_walls_contradict_leads_where_the_ranking_has_no_culprit() 
     # Another culprit bends the walls.
     culprit = replace(calm, suspects=(suspect("gnss.drift", 8.0), clock))
     assert clock_findings(["drive"], [term(front=(0.02, 0.001))], culprit) == ()
+
+
+SLIP = MountSlip(("front",), (), 13.2, 25.0, np.array([0.0, 0.0, 0.0174, 0.003, 0.0, 0.0]), 16.4)
+
+
+def test_a_mount_that_slips_is_a_contradiction_if_nothing_else_is_wrong() -> None:
+    calm = replace(make_calibration(), suspects=(suspect("ground.vehicle_height", 2.0),))
+    slips = [replace(term(), slip=replace(SLIP, sigmas=s)) for s in (16.4, 4.5, 3.9)]
+
+    found = slip_findings(["one"], [*slips, term()], calm)
+
+    assert [f.severity for f in found] == ["contradiction", "warning"]
+    assert [f.input for f in found] == ["lidars.front.mount.halves"] * 2
+    culprit = replace(calm, suspects=(suspect("gnss.lever_arm", 8.0),))
+    assert slip_findings(["one"], slips, culprit) == ()
 
 
 def apart(**told: float) -> StructureTerm:

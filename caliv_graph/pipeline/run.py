@@ -31,6 +31,7 @@ from caliv_graph.physics import (
     contradictions_of,
     ranked_with,
     raw_findings,
+    slip_findings,
     warnings_of,
     without_effects,
 )
@@ -183,8 +184,11 @@ def _calibrated(
             displaced=bool(prepared.misplaced or prepared.contradictions),
         )
         names = [recording.name for recording in recordings]
-        clocks = clock_findings(names, solution.structure, calibration)
-        findings = (*prepared.findings, *clocks)
+        slips = slip_findings(names, solution.structure, calibration)
+        # A mount that slips looks like stamps that are late against those of other LiDARs.
+        slipped = contradictions_of(slips)
+        clocks = () if slipped else clock_findings(names, solution.structure, calibration)
+        findings = (*prepared.findings, *clocks, *slips)
         doubts = without_effects(doubts, clocks, calibration)
         said, unread = prepared.mistakes, ""
         blamed = _blamed(calibration, concerned)
@@ -203,7 +207,7 @@ def _calibrated(
         )
         calibration, conflicts = with_prior(calibration, prior, config)
 
-    doubts = (*doubts, *warnings_of(clocks), *([unread] if unread else []))
+    doubts = (*doubts, *warnings_of(clocks), *warnings_of(slips), *([unread] if unread else []))
     of_prior = calibration.warnings
     warnings = (*notes, *prepared.warnings, *solution.warnings, *doubts, *conflicts, *of_prior)
     record = RunRecord(

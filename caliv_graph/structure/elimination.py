@@ -62,18 +62,28 @@ class Surfaces:
             halves.append(half)
         return self._followed(solved(factor, rest), halves)
 
-    def reduced(self, rows: Array) -> tuple[Array, Array]:
+    def reduced(self, rows: scipy.sparse.csr_array) -> tuple[Array, Array, Array]:
         """Rows (r, D) on what remains, (r, R), the eliminated coordinates following it.
 
-        Also the covariance (r, r) of the rows by these coordinates, the rest being known.
+        Also the covariance (r, r) of the rows by these coordinates, the rest being known, and what
+        the rows are (r,) where the rest is zero.
         """
-        out = rows[:, : self.rest].copy()
-        cov = np.zeros((len(rows), len(rows)))
+        out = rows[:, : self.rest].toarray()
+        cov, at_zero = np.zeros((len(out), len(out))), np.zeros(len(out))
+        columns = rows[:, self.rest :].T.tocsr()
         for block in self.blocks:
-            half = _lower(block.L, rows[:, block.own].T)
-            out[:, block.others] -= half.T @ block.coupling
-            cov += half.T @ half
-        return out, cov
+            own = block.own - self.rest
+            place, row, value = entries(columns, own)
+            used, row = np.unique(row, return_inverse=True)
+            right = np.zeros((len(own), len(used) + 1))
+            right[place, row] = value
+            right[:, -1] = self.right[own]
+            half = _lower(block.L, right)
+            half, known = half[:, :-1], half[:, -1]
+            out[np.ix_(used, block.others)] -= half.T @ block.coupling
+            cov[np.ix_(used, used)] += half.T @ half
+            at_zero[used] += half.T @ known
+        return out, cov, at_zero
 
     def follow(self, d: Array) -> Array:
         """The whole step (D,) from that (R,) of the coordinates that remain."""
@@ -270,18 +280,43 @@ def half_solved(factor: tuple[Array, Array], right: Array) -> Array:
     )
 
 
-def marginal(H: Array, b: Array, keep: IntArray, rest: IntArray) -> tuple[Array, Array]:
+@dataclass(frozen=True)
+class Further:
+    """k further coordinates of a quadratic.
+
+    Attributes:
+        rows: (k, D) their information with the others.
+        information: (k, k) of their own.
+        gradient: (k,).
+    """
+
+    rows: Array
+    information: Array
+    gradient: Array
+
+
+def marginal(
+    H: Array, b: Array, keep: IntArray, rest: IntArray, further: Further | None = None
+) -> tuple[Array, Array]:
     """Information and gradient of coordinates `keep` of a Gaussian, those of `rest` eliminated.
+
+    Those of `further` are kept as well, the last ones.
 
     Raises:
         SolveError: `rest` is singular.
     """
+    inside, own, across = H[np.ix_(keep, keep)], b[keep], H[np.ix_(keep, rest)]
+    if further is not None:
+        coupling = further.rows[:, keep]
+        inside = np.block([[inside, coupling.T], [coupling, further.information]])
+        own = np.concatenate([own, further.gradient])
+        across = np.concatenate([across, further.rows[:, rest]])
     if not len(rest):
-        return H[np.ix_(keep, keep)], b[keep]
+        return inside, own
     factor = factor_of(H[np.ix_(rest, rest)], overwrite=True)
-    half = half_solved(factor, np.column_stack([H[np.ix_(keep, rest)].T, b[rest]]))
+    half = half_solved(factor, np.column_stack([across.T, b[rest]]))
     known = half.T @ half
-    return H[np.ix_(keep, keep)] - known[:-1, :-1], b[keep] - known[:-1, -1]
+    return inside - known[:-1, :-1], own - known[:-1, -1]
 
 
 def covariance_of(factor: tuple[Array, Array], own: IntArray) -> Array:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.elimination import marginal
+from caliv_graph.structure.elimination import Further, marginal
 from caliv_graph.structure.layout import Layout
 from caliv_graph.structure.noise import LEAST_JITTER_S, MOST_JITTER_S
 from caliv_graph.structure.problem import OFFSET_SIGMA_S
@@ -53,15 +53,19 @@ class Clocks:
         return cls(late, apart)
 
 
-def told_of_jitters(H: Array, b: Array, layout: Layout) -> tuple[Array, Array]:
+def told_of_jitters(
+    H: Array, b: Array, layout: Layout, further: Further | None = None
+) -> tuple[Array, Array]:
     """Information A (S, S) and gradient u (S,) of the jitters, everything else eliminated.
 
     Args:
         H: (R, R) of the first `layout.plane` coordinates, no prior of the jitters in it.
         b: (R,).
         layout: with jitters.
+        further: coordinates that are kept as well, the last ones of A and u.
     """
-    return marginal(H, b, np.arange(layout.jitter, layout.plane), np.arange(layout.jitter))
+    jitters = np.arange(layout.jitter, layout.plane)
+    return marginal(H, b, jitters, np.arange(layout.jitter), further)
 
 
 def told_clocks(A: Array, u: Array, scan_lidar: IntArray, lidars: int) -> tuple[Array, Array]:

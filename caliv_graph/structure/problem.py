@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.config.range_errors import UNSTATED, RangeErrors
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import (
     right_to_vehicle_axes,
     stack,
@@ -130,6 +131,43 @@ def first_state(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> State:
 def part_of(problem: Problem, keep: BoolArray) -> Problem:
     """The same drive with some of its patches (N,)."""
     return replace(problem, patches=problem.patches.part(keep), relative=problem.relative[keep])
+
+
+SLIP = np.repeat([0.2, 0.3], 3)
+"""1 sigma of the slip of a mount, rad and m: more than any that still carries its LiDAR."""
+
+LATER = "{} later"
+"""Name of a LiDAR after the slip of its mount."""
+
+
+def slipped_apart(problem: Problem, lidar: int, since_s: float) -> Problem:
+    """The same drive with a LiDAR that is another one, the last, from a time on.
+
+    `since_s` counts from the first scan. Without errors of beams, which have each their own LiDAR.
+    """
+    patches, n = problem.patches, len(problem.patches.lidars)
+    passed_s = (patches.stamps_ns - patches.stamps_ns.min()) / NANOSECONDS_PER_SECOND
+    later = (patches.scan_lidar == lidar) & (passed_s >= since_s - 1e-6)
+    held = np.zeros((6 * (n + 1), 6 * (n + 1)))
+    own = slice(6 * lidar, 6 * lidar + 6)
+    held[: 6 * n, : 6 * n] = problem.held_information
+    where = np.linalg.inv(problem.held_information[own, own]) + np.diag(SLIP**2)
+    held[6 * n :, 6 * n :] = np.linalg.inv(where)
+    moved_with = patches.moved_with
+    return replace(
+        problem,
+        patches=replace(
+            patches,
+            lidars=(*patches.lidars, LATER.format(patches.lidars[lidar])),
+            scan_lidar=np.where(later, n, patches.scan_lidar),
+            moved_with=(*moved_with, moved_with[lidar]) if moved_with else (),
+        ),
+        offsets=(*problem.offsets, n) if lidar in problem.offsets else problem.offsets,
+        guesses=(*problem.guesses, problem.guesses[lidar]),
+        held_at=(*problem.held_at, problem.held_at[lidar]),
+        held_information=held,
+        beam_nodes=(),
+    )
 
 
 @dataclass(frozen=True)

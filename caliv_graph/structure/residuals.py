@@ -25,6 +25,9 @@ DENT_RAD = 0.05
 bonnet, is a surface of its own."""
 
 
+EXTRINSIC_ROWS = slice(6, 12)
+"""Where the derivatives by the extrinsic are in `Geometry.by`: after the pose."""
+
 PLANE_ROWS = slice(12, 15)
 """Where the derivatives by the plane are in `Geometry.by`: after pose and extrinsic."""
 

@@ -9,7 +9,7 @@ import scipy.sparse
 
 from caliv_graph.products import Array, IntArray
 from caliv_graph.structure.layout import Layout, Nuisances
-from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
+from caliv_graph.structure.residuals import EXTRINSIC_ROWS, PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings, without_own_error
 from caliv_graph.structure.sparse_parts import difference_of_squares, members
 
@@ -45,6 +45,7 @@ class Rows:
         shared_noise: (G,) the same of `shared^T r`.
         scan: (Q,) the scan of each sighting.
         scan_of_group: (G,) the scan of each of the shared offsets.
+        noise_by_extrinsic: (Q, 6) what each sighting adds to `of_noise` of its LiDAR's extrinsic.
     """
 
     J: scipy.sparse.csr_array
@@ -54,6 +55,7 @@ class Rows:
     shared_noise: Array
     scan: IntArray
     scan_of_group: IntArray
+    noise_by_extrinsic: Array
 
     def normal_equations(self, rest: int) -> Quadratic:
         """The system, the shared offsets eliminated.
@@ -149,7 +151,16 @@ def whitened(
     of_groups = np.bincount(number.ravel(), of_offset, len(groups))
     r = np.einsum("qi,qij->jq", geometry.plain, C).ravel()
     scan = sightings.scan
-    return Rows(J, r, shared, np.asarray(of_noise), np.asarray(of_groups), scan, scan[first])
+    return Rows(
+        J,
+        r,
+        shared,
+        np.asarray(of_noise),
+        np.asarray(of_groups),
+        scan,
+        scan[first],
+        np.einsum("qci,qi->qc", geometry.by[:, EXTRINSIC_ROWS], of_plane),
+    )
 
 
 def roots_of(S: Array) -> Array:

@@ -12,10 +12,11 @@ import numpy as np
 
 from caliv_graph.common.memory import give_back_freed_arrays, give_back_freed_memory
 from caliv_graph.config.range_errors import RangeErrors
-from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.geometry.se3 import vehicle_axes_difference
+from caliv_graph.products import Array, BoolArray, IntArray, MountSlip
 from caliv_graph.structure.beams import usual_sigmas
 from caliv_graph.structure.bends import USUAL_PER_M
-from caliv_graph.structure.elimination import covariance_of, factor_of, solved
+from caliv_graph.structure.elimination import Further, covariance_of, factor_of, solved
 from caliv_graph.structure.jitter import Clocks, jitter_sigma_s, told_clocks, told_of_jitters
 from caliv_graph.structure.layout import Layout, Nuisances, State, stepped
 from caliv_graph.structure.noise import (
@@ -34,11 +35,13 @@ from caliv_graph.structure.problem import (
     layout_of,
     placed_patches,
     placed_sightings,
+    slipped_apart,
     with_hold,
 )
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.rows import Rows, whitened
 from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.slips import ToldSlips, slip_coupling, told_slips
 from caliv_graph.structure.standing import Stands, stands_of
 from caliv_graph.structure.strips import Strips, find_strips
 from caliv_graph.structure.system import System, system_of
@@ -150,12 +153,14 @@ class Solved(Estimate):
         offsets_m: (Q,) `Geometry.offsets_m`.
         plane_rows: (Q, 3) `Geometry.plane_rows`.
         clocks: of LiDARs whose clocks are held.
+        slips: of mounts that slip; None: not tested.
     """
 
     system: System
     offsets_m: Array
     plane_rows: Array
     clocks: Clocks = field(default_factory=Clocks)
+    slips: ToldSlips | None = None
 
     @cached_property
     def factor(self) -> tuple[Array, Array]:
@@ -181,10 +186,30 @@ def _linearised(held: list[Sighted]) -> System:
     It takes most of the memory: nobody keeps two, and residuals are let go of when its rows are
     there.
     """
+    rows, found = _rows_of(held)
+    return _system(rows, found)
+
+
+def _linearised_with_slips(held: list[Sighted]) -> tuple[System, Further]:
+    """`_linearised`, and with it the coordinates of slips (`slips.py`)."""
+    rows, found = _rows_of(held)
+    of_scans = found.problem.patches
+    apart = slip_coupling(rows[0], found.layout, of_scans.scan_lidar, of_scans.stamps_ns)
+    system = _system(rows, found)
+    return system, apart.reduced(system.surfaces)
+
+
+def _rows_of(held: list[Sighted]) -> tuple[list[Rows], Estimate]:
+    """The rows of the estimate in `held`, which is taken out, and the estimate."""
     before = held.pop()
     rows, found = [before.rows()], without_residuals(before)
     del before
     give_back_freed_arrays()
+    return rows, found
+
+
+def _system(rows: list[Rows], found: Estimate) -> System:
+    """The system of an estimate with `rows`, which are taken out."""
     return system_of(  # it lets go of the rows, which nobody else may hold
         rows.pop(),
         found.state,
@@ -264,11 +289,11 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         levels, state = found.levels(), found.state
     if found is None:
         return None
-    clocks = Clocks()
+    clocks, slips = Clocks(), None
     if own.twists is None:
         found, gradient = _with_gradient(with_residuals(found))
     else:
-        jittering, system, clocks = _with_jitter(found)
+        jittering, system, clocks, slips = _with_jitter(found)
         gradient = system.b[: found.layout.plane]
         systems = [system]
         del system
@@ -278,7 +303,7 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
     # Handed over, as its prior on the poses with scans is not needed beside that on all.
     held = [found]
     del own, found
-    return replace(_on_all_poses(held, problem, poses, gradient), clocks=clocks)
+    return replace(_on_all_poses(held, problem, poses, gradient), clocks=clocks, slips=slips)
 
 
 def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved | None:
@@ -297,6 +322,25 @@ def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved 
         return None
     found, gradient = _with_gradient(_settled(found, STEPS[0]))
     return _on_all_poses([found], problem, np.arange(len(problem.prior.stamps_ns)), gradient)
+
+
+def measured_slip(problem: Problem, start: Mapping[str, gtsam.Pose3], slip: MountSlip) -> MountSlip:
+    """The slip of one LiDAR with its size by a rough solve in which it is two LiDARs.
+
+    The linear estimate is too small: what is seen from farther off than the gates is left out.
+
+    Raises:
+        SolveError: the system is singular.
+    """
+    names = problem.patches.lidars
+    own = names.index(slip.lidars[0])
+    apart = slipped_apart(problem, own, slip.since_s)
+    before = start[names[own]]
+    range_sigma = range_sigmas(apart.patches, apart.range_sigma_m)
+    begun = {**start, apart.patches.lidars[-1]: before}
+    state, _ = _rough(replace(apart, beam_nodes=(), bent=False), begun, range_sigma)
+    T = state.T_vehicle_lidar
+    return replace(slip, change=vehicle_axes_difference(T[-1], T[own]))
 
 
 def _rough(
@@ -323,11 +367,11 @@ def _rough(
     return on_all_poses(problem.prior, poses, rough), levels
 
 
-def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks]:
+def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks, ToldSlips]:
     """The same estimate with a jitter of every scan's stamp; None where the data show none.
 
     And its system. Where there is none, the jitters are its last coordinates, without a prior. And
-    what they tell of clocks that are held.
+    what they tell of clocks that are held, and what is told of mounts that slip.
     """
     problem = found.problem
     first, scans = found.layout.plane, len(problem.patches.stamps_ns)
@@ -336,25 +380,28 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks]:
     state = replace(found.state, errors=errors)
     jittering = replace(found, state=state, layout=layout)
     give_back_freed_memory()
-    system = _linearised([with_residuals(jittering)])
+    system, of_slips = _linearised_with_slips([with_residuals(jittering)])
     give_back_freed_memory()
     # The hold in place, and out again: a copy would be as large as the system.
     held = slice(layout.offset, layout.error)
     without = system.H[held, held].copy(), system.b[held].copy()
     add_hold(problem, state, layout, system.H, system.b)
-    A, u = told_of_jitters(system.H, system.b, layout)
+    together, pull = told_of_jitters(system.H, system.b, layout, of_slips)
     system.H[held, held], system.b[held] = without
+    A, u = together[:scans, :scans], pull[:scans]
     names = problem.patches.lidars
     clocks = Clocks()
     if not layout.offsets:
         clocks = Clocks.told(names, *told_clocks(A, u, problem.patches.scan_lidar, len(names)))
     sigma_s = jitter_sigma_s(A, u)
+    told = told_slips(together, pull, sigma_s, problem.patches.scan_lidar, len(names))
+    slips = ToldSlips(names, problem.patches.stamps_ns, *told, state.T_vehicle_lidar)
     if sigma_s == 0.0:
-        return None, system, clocks
+        return None, system, clocks, slips
     own = np.arange(layout.jitter, layout.plane)
     system.H[own, own] += sigma_s**-2.0
     nuisances = replace(found.nuisances, jitter_s=sigma_s)
-    return replace(jittering, nuisances=nuisances), system, clocks
+    return replace(jittering, nuisances=nuisances), system, clocks, slips
 
 
 def _on_all_poses(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 
 from caliv_graph.products import Array, Stance, StandingErrors
 from caliv_graph.structure.elimination import marginal
@@ -49,7 +50,7 @@ def mean_tilt(found: Solved) -> MeanTilt | None:
         layout.plane,
         layout.size,
     )
-    on_rest, cov = found.system.surfaces.reduced(rows)
+    on_rest, cov, _ = found.system.surfaces.reduced(scipy.sparse.csr_array(rows))
     return MeanTilt(value, on_rest, cov + sigma**2 * np.eye(2))
 
 

@@ -15,9 +15,10 @@ from caliv_graph.common.memory import give_back_freed_memory
 from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.config.range_errors import range_errors
+from caliv_graph.errors import SolveError
 from caliv_graph.geometry.quadratic import without_errors
 from caliv_graph.geometry.se3 import unstack
-from caliv_graph.products import Array, IntArray, Strip, StructureTerm
+from caliv_graph.products import Array, IntArray, MountSlip, Strip, StructureTerm
 from caliv_graph.structure.align import align_patches
 from caliv_graph.structure.beams import CHANNEL_KINDS, beam_nodes, parts_of
 from caliv_graph.structure.elimination import factor_of, half_solved
@@ -32,7 +33,8 @@ from caliv_graph.structure.relative import (
     relative_quadratic,
     start_about,
 )
-from caliv_graph.structure.solve import Solved, solve_structure
+from caliv_graph.structure.slips import SAID_SIGMAS
+from caliv_graph.structure.solve import Solved, measured_slip, solve_structure
 from caliv_graph.structure.stance import (
     STANDING,
     MeanTilt,
@@ -116,18 +118,37 @@ def structure_terms(
         # What the aligning and the solve leave behind in pieces would come on top of what follows.
         give_back_freed_memory()
         found = solve_structure(problem, start)
-        del problem
         if found is None:
             continue
-        give_back_freed_memory()
         own_odometry = odometry_of([trajectory])
+        slip = _slip(found, problem, own_odometry)
+        del problem
+        give_back_freed_memory()
         handed = [found]
         del found
         if own_odometry is None:
-            out.append(term_of(handed.pop(), places))
+            out.append(replace(term_of(handed.pop(), places), slip=slip))
         else:
-            out.append(term_of_odometry(handed.pop(), places, own_odometry, config))
+            term = term_of_odometry(handed.pop(), places, own_odometry, config)
+            out.append(replace(term, slip=slip))
     return tuple(out)
+
+
+def _slip(found: Solved, problem: Problem, odometry: OdometryPoses | None) -> MountSlip | None:
+    """The slip that a solved drive would rather have; None: not tested."""
+    if found.slips is None:
+        return None
+    slip = found.slips.slip()
+    if odometry is not None and odometry.lidar not in (*slip.lidars, *slip.others):
+        # Poses are of this LiDAR: if its mount slips, another one seems to.
+        slip = replace(slip, others=(*slip.others, odometry.lidar))
+    if len(slip.lidars) > 1 or slip.sigmas < SAID_SIGMAS:
+        return slip
+    start = dict(zip(problem.patches.lidars, found.state.T_vehicle_lidar, strict=True))
+    try:
+        return measured_slip(problem, start, slip)
+    except SolveError:
+        return slip
 
 
 def odometry_of(trajectories: Sequence[VehicleTrajectory]) -> OdometryPoses | None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
-from caliv_graph.products import Finding, Suspect
+from caliv_graph.products import Finding, MountSlip, Suspect
 from caliv_graph.uncertainty.consistency import (
     CLOCK_BIAS_S,
     CLOCK_JITTER_S,
@@ -135,6 +136,50 @@ def apart_finding(
         "without a time per point look the same, and no offset mends them. A LiDAR whose mount "
         "moved during the drive may look like this, too: 'caliv-graph validate' then contradicts "
         "the result on held-out structure",
+    )
+
+
+def slip_finding(drive: str, slip: MountSlip) -> Finding | None:
+    """A mount that slips by the walls and the ground of a drive; None if none does."""
+    if slip.sigmas < DOUBT_SIGMAS:
+        return None
+    contradiction = slip.sigmas > CONTRADICTION_SIGMAS
+    first = slip.lidars[0]
+    when = f"{slip.since_s:.0f} s after the first scan, of {slip.lasts_s:.0f} s"
+    by = f"by the surfaces around ({slip.sigmas:.0f} sigma)"
+    between = "One extrinsic cannot be right before and after it: S2S and S2V are in between"
+    if len(slip.lidars) > 1:
+        verb = "move" if contradiction else "may move"
+        sentence = (
+            f"{drive}: all lidars {verb} together against the motion data about {when}, {by}: "
+            f"they are {_moved(slip)}. {between}. Check whether their common rack, the IMU or an "
+            f"antenna moved, or load or tyres changed; {_RECORD_AGAIN}"
+        )
+    else:
+        verb = "slips" if contradiction else "may slip"
+        who = " or ".join(f"'{name}'" for name in (first, *slip.others))
+        size = f"it is {_moved(slip)}"
+        if slip.others:
+            size = f"the drive does not tell which; if it is '{first}', {size}"
+        sentence = (
+            f"{drive}: the mount of lidar {who} {verb} about {when}, {by}: {size}. {between}. "
+            f"Fasten the mount{', and those of IMU and antenna,' if slip.alone else ''} and "
+            f"{_RECORD_AGAIN}"
+        )
+    severity: Literal["contradiction", "warning"] = "contradiction" if contradiction else "warning"
+    return Finding(f"lidars.{first}.mount.halves", (), 0.0, slip.sigmas, severity, sentence)
+
+
+_RECORD_AGAIN = "record again, or cut the recording there and calibrate each part by itself"
+
+
+def _moved(slip: MountSlip) -> str:
+    turn_deg = [math.degrees(angle) for angle in slip.change[:3]]
+    shift_mm = [1e3 * way for way in slip.change[3:]]
+    return (
+        f"turned by {math.hypot(*turn_deg):.2f} degrees (roll, pitch, yaw "
+        f"{', '.join(f'{angle:+.2f}' for angle in turn_deg)}) and shifted by "
+        f"{math.hypot(*shift_mm):.0f} mm (x, y, z {', '.join(f'{way:+.0f}' for way in shift_mm)})"
     )
 
 

@@ -22,7 +22,7 @@ from caliv_graph.structure.jitter import Clocks
 from caliv_graph.structure.noise import ONE_VIEW_M, range_sigmas
 from caliv_graph.structure.problem import Problem, geometry_at, part_of
 from caliv_graph.structure.residuals import Geometry
-from caliv_graph.structure.solve import Solved, solve_structure
+from caliv_graph.structure.solve import Solved, measured_slip, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.system import System, system_of
 from caliv_graph.structure.term import FRAME_ARM_M, FRAME_PART, term_of
@@ -32,6 +32,7 @@ from tests.structure.yards import (
     STEP_NS,
     TRUE,
     Noise,
+    Slip,
     Wall,
     draw_patches,
     draw_prior,
@@ -53,17 +54,18 @@ def problem_of(
     jitter_s: float = 0.0,
     extrinsics: dict[str, gtsam.Pose3] = TRUE,
     clock_s: float = 0.0,
+    slip: Slip | None = None,
 ) -> Problem:
     """A drive; `jitter_s` is 1 sigma of the time at which a scan is taken after its stamp.
 
-    All stamps are late by `clock_s`.
+    All stamps are late by `clock_s`; a mount may slip.
     """
     rng = np.random.default_rng(seed)
     true_poses = poses(*path)
     twists = _twists(true_poses)
     late_s = jitter_s * np.random.default_rng([seed, 1]).standard_normal(len(twists)) - clock_s
     taken = [T.retract(d) for T, d in zip(true_poses, late_s[:, None] * twists, strict=True)]
-    patches = draw_patches(walls, taken, rng, noise, extrinsics, patch_m=1.0)
+    patches = draw_patches(walls, taken, rng, noise, extrinsics, patch_m=1.0, slip=slip)
     off = [rng.uniform(-0.005, 0.005, 6) for _ in extrinsics]
     guesses = tuple(T.retract(d) for T, d in zip(extrinsics.values(), off, strict=True))
     return Problem(
@@ -120,6 +122,34 @@ def motion_of(found: Solved) -> Array:
 @pytest.fixture(scope="module")
 def solved() -> Solved:
     return solve(problem_of(yard(), figure_eight(24), 1))
+
+
+def test_a_mount_that_slips_is_found(solved: Solved) -> None:
+    """The right one, its size by a solve in which it is two LiDARs; none where none slips."""
+    for name in ("front", "rear"):
+        by = np.array([0.002, -0.003, 0.015, 0.01, -0.02, 0.0])
+        own = list(TRUE).index(name)
+        problem = problem_of(yard(), figure_eight(24), 1, slip=Slip((own,), 12, by))
+        found = solve(problem)
+        assert found.slips is not None
+        slip = found.slips.slip()
+        assert (slip.lidars, slip.others) == ((name,), ())
+        assert slip.since_s == pytest.approx(12 * STEP_NS * 1e-9)
+        assert slip.lasts_s == pytest.approx(23 * STEP_NS * 1e-9)
+        assert slip.sigmas > 10.0
+        start = dict(zip(TRUE, found.state.T_vehicle_lidar, strict=True))
+        measured = measured_slip(problem, start, slip)
+        R = TRUE[name].rotation().matrix()
+        assert measured.change[:3] == pytest.approx(R @ by[:3], abs=1e-3)
+        assert measured.change[3:5] == pytest.approx((R @ by[3:])[:2], abs=0.01)
+    assert solved.slips is not None
+    assert solved.slips.slip().sigmas < 3.0
+
+
+def test_late_stamps_are_no_slip(solved: Solved) -> None:
+    late = solve(problem_of(yard(), figure_eight(24), 1, clock_s=0.02))
+    assert late.slips is not None
+    assert late.slips.slip().sigmas < 4.0
 
 
 def test_a_late_clock_shows_while_it_is_held(solved: Solved) -> None:

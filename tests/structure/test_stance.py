@@ -145,9 +145,12 @@ def test_rows_follow_the_surfaces_that_are_eliminated() -> None:
     H, nothing = J.T @ J, scipy.sparse.csr_array((1, 7))
     blocks = [np.array([3, 4]), np.array([5, 6])]
     others = scipy.sparse.csr_array(H[3:])
-    surfaces = eliminated(H[:3, :3].copy(), others, nothing, np.zeros(7), blocks)[2]
-    rows = rng.standard_normal((2, 7))
-    reduced, cov = surfaces.reduced(rows)
+    b = rng.standard_normal(7)
+    surfaces = eliminated(H[:3, :3].copy(), others, nothing, b, blocks)[2]
+    rows = rng.standard_normal((3, 7))
+    rows[2, 3:5] = 0.0
+    reduced, cov, at_zero = surfaces.reduced(scipy.sparse.csr_array(rows))
     inverse = np.linalg.inv(H[3:, 3:])
     assert reduced == pytest.approx(rows[:, :3] - rows[:, 3:] @ inverse @ H[3:, :3])
     assert cov == pytest.approx(rows[:, 3:] @ inverse @ rows[:, 3:].T)
+    assert at_zero == pytest.approx(rows[:, 3:] @ inverse @ b[3:])

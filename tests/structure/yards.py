@@ -98,6 +98,20 @@ def channel_errors(noise: Noise, lidar: int) -> Array:
     return noise.channel_m * np.random.default_rng([lidar, 7]).standard_normal(360)
 
 
+@dataclass(frozen=True)
+class Slip:
+    """From a pose on the mounts of some LiDARs are elsewhere: `T_vehicle_lidar Exp(by)`."""
+
+    lidars: tuple[int, ...]
+    pose: int
+    by: Array
+
+    def moved(self, lidar: int, pose: int, T_vehicle_lidar: gtsam.Pose3) -> gtsam.Pose3:
+        """T_vehicle_lidar of a LiDAR at a pose."""
+        slipped = lidar in self.lidars and pose >= self.pose
+        return T_vehicle_lidar.retract(self.by) if slipped else T_vehicle_lidar
+
+
 def draw_patches(
     walls: Sequence[Wall],
     T_map_vehicle: Sequence[gtsam.Pose3],
@@ -108,6 +122,7 @@ def draw_patches(
     patch_m: float = 0.7,
     half_fov_rad: float = np.radians(60.0),
     range_m: float = 60.0,
+    slip: Slip | None = None,
 ) -> DrivePatches:
     """Patches of walls as seen from true poses, all LiDARs at all stamps."""
     cells = [rng.standard_normal((40, 10)) * noise.bump_m for _ in walls]
@@ -121,7 +136,7 @@ def draw_patches(
         for i, X in enumerate(T_map_vehicle):
             stamps.append(i * STEP_NS)
             scan_lidar.append(number)
-            L = X.compose(T)
+            L = X.compose(T if slip is None else slip.moved(number, i, T))
             (R,), (t,) = stack([L])
             for w, wall in enumerate(walls):
                 centre, normal, along = wall.axes()

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from caliv_graph.products import Suspect
+from caliv_graph.products import MountSlip, Suspect
 from caliv_graph.wording.suspects import (
     doubt_sentence,
     motion_sentence,
     ranking_sentence,
     remedy,
+    slip_finding,
     suspect_row,
 )
 
@@ -119,3 +121,39 @@ def test_without_an_imu_an_axle_that_is_elsewhere_looks_like_the_antenna() -> No
     text = ranking_sentence([arm], of_wheels=True)
     assert "Or the axle that does not steer is elsewhere: wheels.T_vehicle_wheels.xyz" in text
     assert "by (-1.30, " in text
+
+
+SLIP = MountSlip(
+    ("front",), (), 13.2, 25.0, np.array([0.0, -0.00349, 0.01745, 0.003, 0.004, 0.0]), 16.4
+)
+SIZE = (
+    "turned by 1.02 degrees (roll, pitch, yaw +0.00, -0.20, +1.00) and shifted by 5 mm (x, y, z "
+    "+3, +4, +0)"
+)
+
+
+def said(slip: MountSlip) -> str:
+    found = slip_finding("drive", slip)
+    assert found is not None
+    return found.sentence
+
+
+def test_a_mount_that_slips_is_named_with_its_size_and_what_to_do() -> None:
+    assert said(SLIP) == (
+        "drive: the mount of lidar 'front' slips about 13 s after the first scan, of 25 s, by the "
+        f"surfaces around (16 sigma): it is {SIZE}. One extrinsic cannot be right before and after "
+        "it: S2S and S2V are in between. Fasten the mount and record again, or cut the recording "
+        "there and calibrate each part by itself"
+    )
+    either = said(replace(SLIP, others=("rear",)))
+    assert "the mount of lidar 'front' or 'rear' slips about" in either
+    assert f": the drive does not tell which; if it is 'front', it is {SIZE}." in either
+    assert "lidar 'front' may slip about" in said(replace(SLIP, sigmas=4.5))
+    assert "Fasten the mount, and those of IMU and antenna, and record" in said(
+        replace(SLIP, alone=True)
+    )
+    together = said(replace(SLIP, lidars=("front", "rear")))
+    assert "all lidars move together against the motion data about 13 s" in together
+    assert f"they are {SIZE}. " in together
+    assert "Check whether their common rack, the IMU or an antenna moved" in together
+    assert slip_finding("drive", replace(SLIP, sigmas=3.9)) is None

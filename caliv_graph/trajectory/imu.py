@@ -270,7 +270,8 @@ class DeadReckoning:
         found = self._known.get(asked)
         if found is None:
             while len(self._known) >= KEPT_QUESTIONS:
-                self._known.pop(next(iter(self._known)))
+                # Threads ask at once: another one may have taken it out.
+                self._known.pop(next(iter(tuple(self._known)), asked), None)
             found = self._known[asked] = self._worked_out(stamps_ns)
         return found
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from caliv_graph.products import Array, IntArray, Recording, Strip, StructureTerm
+from caliv_graph.products import Array, IntArray, MountSlip, Recording, Strip, StructureTerm
 from caliv_graph.structure.patches import DrivePatches
 
 SIGMAS = np.array([2e-4] * 3 + [2e-3] * 3)
@@ -49,11 +49,15 @@ class Structure:
     Attributes:
         truth: T_vehicle_lidar of the LiDARs that see it.
         pairs: only how the LiDARs lie to each other, not to the vehicle.
+        slip: of a mount that it would rather have.
+        apart_s: stamps of the last LiDAR later than those of the first, to 0.4 ms.
         called: number of calls.
     """
 
     truth: Mapping[str, gtsam.Pose3]
     pairs: bool = False
+    slip: MountSlip | None = None
+    apart_s: float = 0.0
     called: int = 0
 
     def __call__(
@@ -68,6 +72,7 @@ class Structure:
         self.called += 1
         assert set(self.truth) <= set(start)
         rng = np.random.default_rng(4)
+        names = list(self.truth)
         terms = []
         for of, prior, kept in zip(patches, priors, kept_ns, strict=True):
             stamps = prior.stamps_ns  # type: ignore[attr-defined]
@@ -92,6 +97,8 @@ class Structure:
                     strips=self._strips(of.drive),
                     offset_m=0.003,
                     warnings=("a hedge was left out",),
+                    slip=self.slip,
+                    clocks_apart={(names[0], names[-1]): (self.apart_s, 4e-4)},
                 )
             )
         return tuple(terms)

@@ -27,7 +27,7 @@ from caliv_graph.fusion.merge import merge
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.mounting.doubts import Doubt
 from caliv_graph.pipeline import calibrate, look, with_prior
-from caliv_graph.products import Calibration, MotionData, Recording
+from caliv_graph.products import Calibration, MotionData, MountSlip, Recording
 from caliv_graph.readers.forwarding import ForwardingRecording
 from caliv_graph.report.folder import write_result
 from caliv_graph.report.tables import calibration_table
@@ -117,6 +117,26 @@ def test_without_a_target_structure_calibrates_alone(tmp_path: Path) -> None:
     assert run.solution.factor_kinds.count("structure") == 1
     assert run.solution.factor_kinds.count("ground_plane") > 20
     check_files(run, drive, tmp_path)
+
+
+def test_a_mount_that_slips_is_said_and_clocks_that_it_makes_seem_apart_are_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slip = MountSlip(("rear",), (), 12.0, 25.0, np.array([0.0, 0.0, 0.0175, 0.0, 0.0, 0.0]), 9.0)
+    drive = arc().asked(target=False)
+    found = {}
+    for sigmas in (9.0, 4.5):
+        walls = Structure(arc().truth, slip=replace(slip, sigmas=sigmas), apart_s=0.004)
+        structure(monkeypatch, walls)
+        found[sigmas] = run_on(drive).calibration
+
+    (said,) = found[9.0].contradictions
+    assert found[9.0].status == "inconsistent"
+    assert "the mount of lidar 'rear' slips about 12 s after the first scan" in said
+    assert not any("the stamps of" in line for line in found[9.0].warnings)
+    assert found[4.5].contradictions == ()
+    assert any("the mount of lidar 'rear' may slip" in line for line in found[4.5].warnings)
+    assert any("the stamps of" in line for line in found[4.5].warnings)
 
 
 def check_files(run: CalibrationRun, drive: ChairDrive, folder: Path) -> None:

@@ -153,6 +153,16 @@ def test_all_that_move_alike_are_named_together() -> None:
     assert found.change == pytest.approx(BY, abs=1e-5)
 
 
+def test_a_single_lidar_is_told_by_the_motion_data_alone() -> None:
+    """These have errors of 3 mrad in each part: of half the parts against the others 2.1 mrad."""
+    both = told(slipped(0, 4))
+    H, b = both.information[:EACH, :EACH], both.gradient[:EACH]
+    found = ToldSlips(("front",), STAMPS, H, b, T[:1]).slip()
+    assert (found.lidars, found.others, found.alone) == (("front",), (), True)
+    # (17 / 2.1)^2 of a chi-square with 6 degrees of freedom.
+    assert found.sigmas == pytest.approx(6.9, abs=0.1)
+
+
 def test_what_swings_is_no_slip() -> None:
     """A soft mount: each part has its own mean, of 0.5 mrad; noise alone is nothing."""
     rng = np.random.default_rng(6)

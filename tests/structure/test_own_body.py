@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import gtsam
 import numpy as np
 import pytest
@@ -89,6 +91,15 @@ def read(world: World, trajectory: GivenTrajectory, body: World | None) -> Drive
     return patches
 
 
+WAYS = {"eight": EIGHT, "rocking": rocking(EIGHT), "straight": straight(60.0)}
+
+
+@cache
+def in_yard(way: str, deck: bool) -> DrivePatches:
+    """Patches of the yard along one of `WAYS`, seen over a deck or not."""
+    return read(yard(), WAYS[way], DECK if deck else None)
+
+
 def in_vehicle(patches: DrivePatches) -> tuple[Array, Array]:
     """Centres and normals (N, 3) in the vehicle frame, at the true extrinsics."""
     R, t = stack([s.T_vehicle_lidar for s in lidars(None).values()])
@@ -102,9 +113,9 @@ def on_deck(patches: DrivePatches) -> BoolArray:
     return np.asarray((np.abs(centres[:, 2] - DECK_M) < 0.03) & (normals[:, 2] > 0.95))
 
 
-@pytest.mark.parametrize("trajectory", [EIGHT, rocking(EIGHT), straight(60.0)])
-def test_patches_on_the_deck_are_left_out_and_no_others(trajectory: GivenTrajectory) -> None:
-    patches = read(yard(), trajectory, DECK)
+@pytest.mark.parametrize("way", WAYS)
+def test_patches_on_the_deck_are_left_out_and_no_others(way: str) -> None:
+    trajectory, patches = WAYS[way], in_yard(way, deck=True)
     deck = on_deck(patches)
     assert deck.sum() > 300
     left, found = without_own_body(patches, trajectory, CONFIG)
@@ -118,10 +129,10 @@ def test_patches_on_the_deck_are_left_out_and_no_others(trajectory: GivenTraject
     assert far_m - 0.1 < body.reach_m <= far_m
 
 
-@pytest.mark.parametrize("trajectory", [EIGHT, rocking(EIGHT), straight(60.0)])
-def test_without_a_body_all_patches_stay(trajectory: GivenTrajectory) -> None:
-    patches = read(yard(), trajectory, None)
-    assert without_own_body(patches, trajectory, CONFIG) == (patches, ())
+@pytest.mark.parametrize("way", WAYS)
+def test_without_a_body_all_patches_stay(way: str) -> None:
+    patches = in_yard(way, deck=False)
+    assert without_own_body(patches, WAYS[way], CONFIG) == (patches, ())
 
 
 def test_a_vehicle_that_stands_loses_nothing() -> None:
@@ -181,7 +192,7 @@ def test_ground_is_below_a_place_where_it_is_seen_all_about_it() -> None:
 
 def test_guesses_too_rough_to_tell_body_from_ground_leave_it() -> None:
     """With sigmas of 10 degrees the ground may be as high as the deck."""
-    patches = read(yard(), EIGHT, DECK)
+    patches = in_yard("eight", deck=True)
     assert without_own_body(patches, EIGHT, with_sigma(10.0)) == (patches, ())
 
 
@@ -197,7 +208,7 @@ def with_sigma(degrees: float) -> Config:
 
 
 def test_a_second_lidar_that_sees_no_body_keeps_all() -> None:
-    patches = read(yard(), EIGHT, DECK)
+    patches = in_yard("eight", deck=True)
     left, _ = without_own_body(patches, EIGHT, CONFIG)
     count = [int((p.scan_lidar[p.scan] == 0).sum()) for p in (patches, left)]
     assert count[0] == count[1] > 1000

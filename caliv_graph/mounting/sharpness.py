@@ -178,17 +178,19 @@ def _known(others: Sequence[tuple[Sightings, Array]], cell: float) -> list[IntAr
 
 
 def _side(cell: float) -> int:
-    """Number of cells along a side of the grid."""
+    """Number of cells along a side of the grid, a power of two."""
     return min(round(REPEATS_M / cell), MOST_CELLS)
 
 
 def _cell_of(places: Complex, cell: float, offset: float) -> IntArray:
     """The cell of each place (n,), x + iy."""
     side = _side(cell)
-    column = np.floor(places.real / cell + offset).astype(np.int64) % side
-    row = np.floor(places.imag / cell + offset).astype(np.int64) % side
-    cells: IntArray = column * side + row
-    return cells
+    at = places.view(np.float64) / cell  # x and y in turn
+    at += offset
+    cells = np.floor(at, out=at).astype(np.int64)
+    cells &= side - 1  # the remainder, also of negative ones: a division takes three times as long
+    found: IntArray = cells[::2] * side + cells[1::2]
+    return found
 
 
 def _apart(mountings: Array, sharpness: Array, cell: float, most: int) -> Found:

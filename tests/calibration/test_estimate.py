@@ -1,7 +1,9 @@
 """The stages of an estimate: what is done when one of them fails."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -11,11 +13,21 @@ from caliv_graph.calibration.ground_scatter import MOST, GroundLevels
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.errors import SolveError
 from caliv_graph.pipeline import calibrate
-from tests.drives_with_chair import FIGURE_EIGHT, QUICK, paper_scenario, simulated
+from tests.drives_with_chair import FIGURE_EIGHT, QUICK, ChairDrive, paper_scenario, simulated
+
+FIRST_SOLVE: list[Any] = []
+"""Of `eight`: the tests of further solves ask for none but this."""
+
+
+@cache
+def eight() -> ChairDrive:
+    with TemporaryDirectory() as folder:
+        scenario = paper_scenario(FIGURE_EIGHT, rate_hz=0.625)
+        return simulated(scenario, 1, Path(folder)).asked(registration=QUICK)
 
 
 def test_a_result_is_kept_when_the_solve_that_begins_at_it_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     solved: list[Any] = []
     solve = stages._solved
@@ -32,10 +44,8 @@ def test_a_result_is_kept_when_the_solve_that_begins_at_it_fails(
 
     monkeypatch.setattr(stages, "_for_another_solve", louder)
     monkeypatch.setattr(stages, "_solved", once)
-    scenario = paper_scenario(FIGURE_EIGHT, rate_hz=0.625)
-    drive = simulated(scenario, 1, tmp_path).asked(registration=QUICK)
 
-    run = calibrate([drive.recording], drive.config, SilentProgress())
+    run = calibrate([eight().recording], eight().config, SilentProgress())
 
     result = run.calibration
     first = solved[0].solution.T_vehicle_lidar["front"]
@@ -47,10 +57,9 @@ def test_a_result_is_kept_when_the_solve_that_begins_at_it_fails(
 
 @pytest.mark.parametrize("solves", [3, 4])
 def test_a_result_that_asks_for_one_more_solve_after_the_last_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, solves: int
+    monkeypatch: pytest.MonkeyPatch, solves: int
 ) -> None:
     solve, calls = stages._solved, 0
-    solved: list[Any] = []
 
     def louder(whole: Any, *_: Any) -> Any:
         if calls >= solves:
@@ -61,16 +70,16 @@ def test_a_result_that_asks_for_one_more_solve_after_the_last_says_so(
     def counted(*arguments: Any) -> Any:
         nonlocal calls
         calls += 1
-        if not solved:
-            solved.append(solve(*arguments))
-        return solved[0]
+        if not FIRST_SOLVE:
+            FIRST_SOLVE.append(solve(*arguments))
+        return FIRST_SOLVE[0]
 
     monkeypatch.setattr(stages, "_for_another_solve", louder)
     monkeypatch.setattr(stages, "_solved", counted)
-    scenario = paper_scenario(FIGURE_EIGHT, rate_hz=0.625)
-    drive = simulated(scenario, 1, tmp_path).asked(registration=QUICK)
 
-    warnings = calibrate([drive.recording], drive.config, SilentProgress()).calibration.warnings
+    run = calibrate([eight().recording], eight().config, SilentProgress())
+
+    warnings = run.calibration.warnings
 
     said = [line for line in warnings if "has not settled: solved again 2 times" in line]
     assert calls == min(solves, 1 + stages.FURTHER_SOLVES)

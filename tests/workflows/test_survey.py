@@ -27,6 +27,7 @@ from caliv_graph.scenario.drive_models import (
     StraightDrive,
 )
 from caliv_graph.scenario.model import CropModel, Scenario
+from caliv_graph.scenario.sensor_models import ImuModel
 from caliv_graph.scenario.world_models import ChairModel, CylinderModel
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.workflows.survey import Survey, survey, survey_observations
@@ -40,7 +41,7 @@ TURN = "rotation of all LiDARs about the turn centre: x and yaw together, "
 DRIVES: dict[str, tuple[DriveModel, tuple[float, float], float]] = {
     "straight": (StraightDrive(duration_s=13.0), (12.0, -5.0), 2.0),
     "arc": (ArcDrive(duration_s=17.0), (15.16, -9.16), 2.0),
-    "S-curve": (SCurveDrive(duration_s=22.0), (12.6, -5.2), 2.5),
+    "S-curve": (SCurveDrive(duration_s=22.0), (12.6, -5.2), 2.0),
     "standstill": (StandstillDrive(duration_s=5.0), (7.5, 5.0), 2.5),
 }
 
@@ -55,7 +56,8 @@ def scenario_of(name: str) -> Scenario:
         }
         scenario = scenario.model_copy(update={"lidars": lidars})
     crop = CropModel(margin_m=1.0, elsewhere_stride=12)
-    return scenario.model_copy(update={"crop": crop})
+    imu = ImuModel(rate_hz=50.0)
+    return scenario.model_copy(update={"crop": crop, "imu": imu})
 
 
 QUICK = RegistrationConfig(max_points=120, components=120)

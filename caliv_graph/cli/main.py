@@ -12,6 +12,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from functools import cache
 from types import FrameType
 from typing import Annotated, Any, Self
 
@@ -126,6 +127,12 @@ class _Interrupts:
         signal.raise_signal(self.came)
 
 
+@cache
+def built() -> Any:
+    """All commands, as typer builds them from their signatures: that takes 15 ms."""
+    return typer.main.get_command(app)
+
+
 def run(arguments: Sequence[str]) -> int:
     """Runs a command line, turns all exceptions into messages, and returns the exit code."""
     with _Interrupts() as interrupts, warnings.catch_warnings():
@@ -133,9 +140,7 @@ def run(arguments: Sequence[str]) -> int:
             # Python warnings are for developers; a user cannot act upon them.
             warnings.simplefilter("ignore")
         try:
-            code = typer.main.get_command(app).main(
-                list(arguments), prog_name=_PROGRAM, standalone_mode=False
-            )
+            code = built().main(list(arguments), prog_name=_PROGRAM, standalone_mode=False)
         except BaseException as e:
             code = INTERRUPTED if interrupts.came else _explain(e)
         if code == INTERRUPTED:

@@ -48,6 +48,11 @@ def give_back_freed_arrays() -> None:
         return  # not glibc
 
 
+def anything_is_frozen() -> bool:
+    """Whether a caller has frozen objects; these are counted one by one."""
+    return gc.get_freeze_count() > 0
+
+
 @contextmanager
 def collecting_what_is_new() -> Iterator[None]:
     """Inside, garbage collections pass over the objects that are there already.
@@ -55,7 +60,7 @@ def collecting_what_is_new() -> Iterator[None]:
     A full collection visits every object of the modules, 0.1 s of processor time. A calibration
     asks for several (`give_back_freed_memory`). Where a caller has frozen objects, they stay so.
     """
-    if gc.get_freeze_count():
+    if anything_is_frozen():
         yield
         return
     gc.collect()  # garbage that is frozen would stay, run after run

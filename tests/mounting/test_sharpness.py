@@ -7,7 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from caliv_graph.mounting.sharpness import Sightings, difference_m, sharpest
+from caliv_graph.mounting.sharpness import (
+    CELLS_M,
+    Sightings,
+    _cell_of,
+    _side,
+    difference_m,
+    sharpest,
+)
 from caliv_graph.products import Array
 
 POSTS = np.array([12.0 + 3.0j, -4.0 + 9.0j, 5.0 - 11.0j, 20.0 - 6.0j, -12.0 - 3.0j])
@@ -64,3 +71,15 @@ def test_on_an_arc_two_lidars_agree_although_neither_is_determined() -> None:
 def test_a_turn_by_a_whole_circle_is_none() -> None:
     assert difference_m(np.array([math.pi, 0.0, 0.0]), np.array([-math.pi, 0.0, 0.0])) < 1e-12
     assert difference_m(np.array([0.1, 0.0, 0.0]), np.zeros(3)) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("cell", CELLS_M)
+def test_the_grid_repeats_after_its_side(cell: float) -> None:
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(-500.0, 500.0, (2, 2000))
+    side = _side(cell)
+
+    found = _cell_of(x + 1j * y, cell, 0.5)
+
+    column, row = (np.floor(at / cell + 0.5).astype(np.int64) % side for at in (x, y))
+    assert np.array_equal(found, column * side + row)

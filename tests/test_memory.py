@@ -1,4 +1,4 @@
-"""Memory does not grow with the bag: a drive four times as long, each in a process of its own."""
+"""Memory does not grow with the bag: a drive seven times as long, each in a process of its own."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ for path in sys.argv[1:]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="reads Linux's /proc")
-def test_a_drive_of_four_times_the_length_takes_hardly_more_memory(tmp_path: Path) -> None:
+def test_a_drive_of_seven_times_the_length_takes_hardly_more_memory(tmp_path: Path) -> None:
     sizes_mb, configs = [], []
     for minutes in (0.5, 3.5):
         folder = tmp_path / f"{minutes:g}"

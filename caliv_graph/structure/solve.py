@@ -110,13 +110,13 @@ class Estimate:
         )
 
     def stands(self) -> Stands:
-        """The level strip below each pose with a scan, where there is one."""
-        t_map_vehicle = self.state.t_map_vehicle
+        """The level strip below each pose with a scan, where there is one.
+
+        As the strips are now: one that hardly any sighting holds may have turned upright since.
+        """
+        state = self.state
         stands = stands_of(
-            t_map_vehicle,
-            self.strips.centres_map,
-            self.strips.normals_map,
-            self.problem.standing,
+            state.t_map_vehicle, state.centres_map, state.normals_map, self.problem.standing
         )
         return stands.only(np.isin(stands.pose, self.problem.pose_of_scan))
 

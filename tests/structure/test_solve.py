@@ -192,6 +192,24 @@ def test_a_yard_determines_all_but_the_height(solved: Solved) -> None:
     assert sigma[5] > 0.01  # walls alone do not tell the height
 
 
+def test_the_vehicle_stands_on_strips_as_they_are_now(solved: Solved) -> None:
+    # One that hardly any sighting holds may have turned upright since it was found to be level.
+    state = solved.state
+    pose = int(solved.problem.pose_of_scan[0])
+    centres, normals = state.centres_map.copy(), state.normals_map.copy()
+    centres[0] = state.t_map_vehicle[pose] - [0.0, 0.0, 0.5]
+    normals[0] = [0.0, 0.0, 1.0]
+
+    def stood_on() -> list[int]:
+        now = replace(state, centres_map=centres, normals_map=normals)
+        strips: list[int] = replace(solved, state=now).stands().strip.tolist()
+        return strips
+
+    assert 0 in stood_on()
+    normals[0] = [0.98, 0.1, 0.17]
+    assert 0 not in stood_on()
+
+
 def test_the_noise_of_sightings_is_estimated(solved: Solved) -> None:
     sigma = np.median(solved.nuisances.sighting)
     assert 0.5 * NOISE.sighting_m < sigma < 1.5 * NOISE.sighting_m

@@ -26,6 +26,10 @@ UNDETERMINED_RATIO = 0.5
 """Sigma of the data over sigma of the guesses above which a direction is undetermined (README,
 "The hard switch")."""
 
+NOTHING_RATIO = 100.0
+"""The same ratio above which a direction is lost however many were before: the data say nothing of
+it any more, as where the robust weights have left a LiDAR without clouds."""
+
 WEAK_RATIO = 0.1
 """The same ratio above which a determined direction is weak."""
 
@@ -80,7 +84,8 @@ def spectrum(D: Array, prior: Array, undetermined: int | None = None) -> Spectru
     Args:
         D: (6n, 6n) data information, vehicle axes, all other variables eliminated.
         prior: (6n, 6n) information of the guesses, vehicle axes.
-        undetermined: their number if it was decided before: those of the largest ratio of sigmas.
+        undetermined: their number if it was decided before: those of the largest ratio of sigmas;
+            more, where the data have lost all that they knew since.
     """
     unit = scaling(len(D) // 6)
     values, vectors = np.linalg.eigh(D * np.outer(unit, unit))
@@ -95,7 +100,7 @@ def spectrum(D: Array, prior: Array, undetermined: int | None = None) -> Spectru
     if undetermined is None:
         lost = ratio > UNDETERMINED_RATIO
     else:
-        lost = np.zeros(len(ratio), dtype=bool)
+        lost = ratio > NOTHING_RATIO
         if undetermined:
             lost[np.argsort(ratio, kind="stable")[-undetermined:]] = True
     weak = (ratio > WEAK_RATIO) & ~lost

@@ -457,6 +457,16 @@ def test_the_number_of_lost_directions_may_be_decided_before() -> None:
         assert sorted(lost) == list(range(count))
 
 
+def test_what_the_data_know_nothing_of_is_lost_whatever_was_decided() -> None:
+    # A LiDAR whose clouds have lost their weights: its steps would have no end.
+    D, prior = np.diag([1e4, 1e4, 1e4, 1e4, 0.0, 1e-5]), np.eye(6)
+    split = spectrum(D, prior, 0)
+    assert sorted(np.abs(split.vectors).argmax(axis=0)[split.undetermined]) == [4, 5]
+    step = step_with_prior_in_null_space(D, np.full(6, 1e-9), prior, np.zeros(6), split)
+    assert np.isfinite(step).all()
+    assert np.abs(step).max() < 1e-6
+
+
 # ------------------------------------------------------------------ a solve that respects it
 
 

@@ -310,19 +310,24 @@ def _by_incidence(points: Array, t: Array, normals: Array) -> Array:
     A range that is too long by `growth` puts its point its cosine times that behind the surface.
     It pulls as any residual does: most where the beams graze, as their noise is along them.
     """
-    weight, sums = points[..., 0], points[..., 1:4]
-    beams = sums - weight[..., None] * t[:, None]
-    facing = -np.einsum("jka,ka->jk", beams, normals)
-    seen = weight > 0.0
-    away = np.where(seen, np.sqrt(np.einsum("jka,jka->jk", beams, beams)), 1.0)
+    clouds, components = len(points), len(normals)
+    # A cloud touches a third of the surfels.
+    cell = np.flatnonzero(points[..., 0].ravel() > 0.0)
+    cloud, surfel = np.divmod(cell, components)
+    weight, *sums = points.reshape(-1, 10)[cell, :4].T
+    n, origin = normals.T[:, surfel], t.T[:, cloud]
+    beams = [sums[a] - weight * origin[a] for a in range(3)]
+    away = np.sqrt(beams[0] ** 2 + beams[1] ** 2 + beams[2] ** 2)
+    facing = -(n[0] * beams[0] + n[1] * beams[1] + n[2] * beams[2])
     # A normal is not known better than what is taken for grazing.
-    cosine = np.where(seen, np.clip(facing / np.maximum(away, 1e-300), GRAZING, 1.0), 1.0)
-    behind = -cosine * growth(cosine.ravel()).T.reshape(2, *cosine.shape)
-    out = np.empty((len(points), 6, 2))
-    for kind, of_cells in enumerate(behind):
-        moments = np.swapaxes(of_cells[..., None] * sums, 1, 2) @ normals
-        out[:, :3, kind] = moments[:, [1, 2, 0], [2, 0, 1]] - moments[:, [2, 0, 1], [1, 2, 0]]
-        out[:, 3:, kind] = (of_cells * weight) @ normals
+    cosine = np.clip(facing / np.maximum(away, np.finfo(float).tiny), GRAZING, 1.0)
+    arms = [sums[b] * n[c] - sums[c] * n[b] for b, c in ((1, 2), (2, 0), (0, 1))]
+    parts = [*arms, *(weight * n)]
+    out = np.empty((clouds, 6, 2))
+    for kind, of_kind in enumerate(growth(cosine).T):
+        behind = -cosine * of_kind
+        for axis, part in enumerate(parts):
+            out[:, axis, kind] = np.bincount(cloud, behind * part, clouds)
     return out
 
 

@@ -471,7 +471,7 @@ class MountSlip:
         change: (6,) by which the LiDAR is turned (rad) and shifted (m) by it, vehicle axes, about
             its own origin; several, about that of the vehicle.
         sigmas: how significant it is, an allowance included, of a normal variable.
-        alone: there is no other LiDAR, which would tell it from what turns the motion data.
+        alone: no other LiDAR sees enough to tell it from what turns the motion data.
     """
 
     lidars: tuple[str, ...]

@@ -12,6 +12,7 @@ from caliv_graph.structure.layout import Layout
 from caliv_graph.structure.problem import OFFSET_SIGMA_S
 from caliv_graph.structure.rows import Rows
 from caliv_graph.structure.slips import (
+    MOTION_ALLOWANCE,
     PARTS,
     ToldSlips,
     part_of_scan,
@@ -172,3 +173,44 @@ def test_what_swings_is_no_slip() -> None:
         sigmas = [draw.slip().sigmas for draw in draws]
         assert max(sigmas) < CONTRADICTION_SIGMAS
         assert np.median(sigmas) < 3.0
+
+
+def errors_of_motion(rng: np.random.Generator, lidars: int, joins: int = 0) -> ToldSlips:
+    """Poses in error by `MOTION_ALLOWANCE` in each part, by which all LiDARs seem to move.
+
+    LiDARs but the first see nothing before part `joins`: what they are there is not known.
+    """
+    at = [gtsam.Rot3.RzRyRx(0.1 * i, 0.2, 2.1 * i) for i in range(lidars)]
+    T = tuple(gtsam.Pose3(R, np.array([3.0 * i, 1.0, 2.0])) for i, R in enumerate(at))
+    errors = MOTION_ALLOWANCE * rng.standard_normal((PARTS, 6))
+    H = np.zeros((lidars, EACH, lidars, EACH))
+    truth = np.zeros((lidars, PARTS - 1, 6))
+    for i in range(lidars):
+        truth[i] = (errors[1:] - errors[0]) @ T[i].inverse().AdjointMap().T
+        known = np.eye(PARTS - 1)
+        if i and joins:
+            later = np.arange(PARTS - 1) >= joins - 1
+            known = np.diag(1.0 * later) - np.outer(later, later) / later.sum()
+        H[i, :, i] = np.kron(known, np.diag(np.repeat([1e-4, 1e-3], 3) ** -2.0))
+    flat = H.reshape(lidars * EACH, -1)
+    names = tuple(f"lidar {i}" for i in range(lidars))
+    return ToldSlips(names, np.tile(STAMPS, lidars), flat, flat @ truth.ravel(), T)
+
+
+@pytest.mark.parametrize(("lidars", "joins"), [(1, 0), (2, 0), (4, 0), (8, 0), (2, 4), (4, 2)])
+def test_errors_of_the_motion_data_are_no_slip(lidars: int, joins: int) -> None:
+    """However many LiDARs see them, and whether each sees all of the drive."""
+    rng = np.random.default_rng(7)
+    sigmas = [errors_of_motion(rng, lidars, joins).slip().sigmas for _ in range(40)]
+    assert max(sigmas) < CONTRADICTION_SIGMAS
+    assert np.median(sigmas) < 2.0
+
+
+def test_a_lidar_whose_slip_no_other_one_sees_is_alone() -> None:
+    """The others see nothing: the motion data, or IMU and antenna, may be what moved."""
+    assert not told(slipped(1, 4)).slip().alone
+    H = told(slipped(1, 4)).information
+    H[:EACH] = H[:, :EACH] = 0.0
+    found = ToldSlips(("front", "rear"), np.tile(STAMPS, 2), H, H @ slipped(1, 4).ravel(), T).slip()
+    assert found.lidars == ("rear",)
+    assert found.alone

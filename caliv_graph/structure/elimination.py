@@ -300,23 +300,23 @@ def marginal(
 ) -> tuple[Array, Array]:
     """Information and gradient of coordinates `keep` of a Gaussian, those of `rest` eliminated.
 
-    Those of `further` are kept as well, the last ones.
+    Those of `further` are kept as well, the last ones. b may be several gradients (R, g).
 
     Raises:
         SolveError: `rest` is singular.
     """
     inside, own, across = H[np.ix_(keep, keep)], b[keep], H[np.ix_(keep, rest)]
     if further is not None:
-        coupling = further.rows[:, keep]
+        coupling, k = further.rows[:, keep], len(further.gradient)
         inside = np.block([[inside, coupling.T], [coupling, further.information]])
-        own = np.concatenate([own, further.gradient])
+        own = np.concatenate([own.T, np.broadcast_to(further.gradient, (*b.shape[1:], k))], -1).T
         across = np.concatenate([across, further.rows[:, rest]])
     if not len(rest):
         return inside, own
     factor = factor_of(H[np.ix_(rest, rest)], overwrite=True)
     half = half_solved(factor, np.column_stack([across.T, b[rest]]))
-    known = half.T @ half
-    return inside - known[:-1, :-1], own - known[:-1, -1]
+    known, n = half.T @ half, len(inside)
+    return inside - known[:n, :n], own - known[:n, n:].reshape(own.shape)
 
 
 def covariance_of(factor: tuple[Array, Array], own: IntArray) -> Array:

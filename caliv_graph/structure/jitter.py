@@ -60,7 +60,7 @@ def told_of_jitters(
 
     Args:
         H: (R, R) of the first `layout.plane` coordinates, no prior of the jitters in it.
-        b: (R,).
+        b: (R,), or several gradients (R, g): u (S, g).
         layout: with jitters.
         further: coordinates that are kept as well, the last ones of A and u.
     """

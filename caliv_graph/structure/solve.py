@@ -386,15 +386,19 @@ def _with_jitter(found: Estimate) -> tuple[Estimate | None, System, Clocks, Told
     held = slice(layout.offset, layout.error)
     without = system.H[held, held].copy(), system.b[held].copy()
     add_hold(problem, state, layout, system.H, system.b)
-    together, pull = told_of_jitters(system.H, system.b, layout, of_slips)
-    system.H[held, held], system.b[held] = without
-    A, u = together[:scans, :scans], pull[:scans]
+    with_held = system.b.copy()
+    system.b[held] = without[1]
+    # What is held is no evidence of a slip: a wrong guess would be one where little else is seen.
+    both = np.column_stack([with_held, system.b])
+    together, pull = told_of_jitters(system.H, both, layout, of_slips)
+    system.H[held, held] = without[0]
+    A, u = together[:scans, :scans], pull[:scans, 0]
     names = problem.patches.lidars
     clocks = Clocks()
     if not layout.offsets:
         clocks = Clocks.told(names, *told_clocks(A, u, problem.patches.scan_lidar, len(names)))
     sigma_s = jitter_sigma_s(A, u)
-    told = told_slips(together, pull, sigma_s, problem.patches.scan_lidar, len(names))
+    told = told_slips(together, pull[:, 1], sigma_s, problem.patches.scan_lidar, len(names))
     slips = ToldSlips(names, problem.patches.stamps_ns, *told, state.T_vehicle_lidar)
     if sigma_s == 0.0:
         return None, system, clocks, slips

@@ -27,6 +27,7 @@ from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.system import System, system_of
 from caliv_graph.structure.term import FRAME_ARM_M, FRAME_PART, term_of
 from caliv_graph.structure.thickness import thickness_at_guesses
+from caliv_graph.structure.thinning import with_scans
 from caliv_graph.structure.views import Views
 from tests.structure.yards import (
     STEP_NS,
@@ -150,6 +151,17 @@ def test_late_stamps_are_no_slip(solved: Solved) -> None:
     late = solve(problem_of(yard(), figure_eight(24), 1, clock_s=0.02))
     assert late.slips is not None
     assert late.slips.slip().sigmas < 4.0
+
+
+def test_a_guess_that_is_off_is_no_slip_of_a_lidar_that_joins_halfway() -> None:
+    """What holds the extrinsic before it sees anything is the guess, 0.2 rad off at 0.03."""
+    whole = problem_of(yard(), figure_eight(24), 1)
+    joined = (whole.patches.scan_lidar == 0) | (whole.patches.stamps_ns > 12 * STEP_NS)
+    problem = with_scans(whole, joined)[0]
+    off = problem.held_at[1].retract(np.array([0.0, 0.0, 0.2, 0.3, 0.0, 0.0]))
+    found = solve(replace(problem, held_at=(problem.held_at[0], off)))
+    assert found.slips is not None
+    assert found.slips.slip().sigmas < 3.0
 
 
 def test_a_late_clock_shows_while_it_is_held(solved: Solved) -> None:

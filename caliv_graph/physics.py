@@ -117,6 +117,8 @@ def clock_findings(
     outvotes the target. What else is wrong beyond 5 sigma may bend walls as a late clock does.
     `names` are of the drives.
 
+    In a drive in which a mount slips clocks seem late because of it: nothing is said of them there.
+
     Surfaces tell the clocks of LiDARs against that of the IMU or the poses. Where this was
     estimated as off, the fewer wrong clocks are the likelier: that one, unless one LiDAR alone
     explains as much. Clocks that are all right by that are compared with each other: of this the
@@ -125,6 +127,7 @@ def clock_findings(
     suspects = calibration.suspects
     if suspects and suspects[0].sigmas > CONTRADICTION_SIGMAS:
         return ()
+    terms = [t for t in terms if t.slip is None or t.slip.sigmas <= CONTRADICTION_SIGMAS]
     inertial = [
         float(found.value[0])
         for name, found in calibration.vehicle.items()

@@ -180,6 +180,19 @@ def test_a_mount_that_slips_is_a_contradiction_if_nothing_else_is_wrong() -> Non
     assert slip_findings(["one"], slips, culprit) == ()
 
 
+def test_a_mount_that_slips_says_nothing_against_clocks_in_other_drives() -> None:
+    calm = replace(make_calibration(), suspects=(suspect("ground.vehicle_height", 2.0),))
+    late = term(front=(0.02, 0.001))
+    slips, steady = replace(late, slip=SLIP), replace(late, drive=1)
+
+    found = clock_findings(["one", "two"], [slips, steady], calm)
+
+    assert len(found) == 1
+    assert "two" in found[0].sentence
+    doubted = replace(late, slip=replace(SLIP, sigmas=4.5))
+    assert len(clock_findings(["one"], [doubted], calm)) == 1
+
+
 def apart(**told: float) -> StructureTerm:
     """Clocks that are so many milliseconds later than that of 'front', to 0.2."""
     pairs = {("front", name): (1e-3 * ms, 2e-4) for name, ms in told.items()}

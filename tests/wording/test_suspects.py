@@ -157,14 +157,3 @@ def test_a_mount_that_slips_is_named_with_its_size_and_what_to_do() -> None:
     assert f"they are {SIZE}. " in together
     assert "Check whether their common rack, the IMU or an antenna moved" in together
     assert slip_finding("drive", replace(SLIP, sigmas=3.9)) is None
-
-
-def test_a_single_mount_leads_the_ranking_only_if_it_is_told_which() -> None:
-    def key(slip: MountSlip) -> str:
-        found = slip_finding("drive", slip)
-        assert found is not None
-        return found.input
-
-    assert key(SLIP) == "lidars.front.mount.halves"
-    assert key(replace(SLIP, others=("rear",))) == "lidars.mounts"
-    assert key(replace(SLIP, lidars=("front", "rear"))) == "lidars.mounts"

@@ -58,9 +58,9 @@ which is where it is said)."""
 MOTION_ALLOWANCE = np.repeat([3e-3, 5e-2], 3)
 """What the motion data may have wrong in each part, all LiDARs alike, about the origin of the
 vehicle: slow errors of fixes and side slip are no slips of mounts. On `roundabout` all LiDARs seem
-to turn by 3.4 mrad and to shift by 70 mm, 3.5 sigma without, 1.4 with this. A single LiDAR that
-slips by a degree halfway has 7. As an error of each LiDAR by itself, the mean of four would be
-taken to be twice as good. Which LiDAR it is is asked without: that of one which others contradict.
+to turn by 3.4 mrad and to shift by 70 mm, 3.5 sigma without, 1.4 with this. The only LiDAR of
+`street` has 4 if it slips by a degree halfway, 7 by two. As an error of each LiDAR by itself, the
+mean of four would be taken to be twice as good. Which LiDAR slips is asked without.
 """
 
 SAME_SIGMAS = 5.0

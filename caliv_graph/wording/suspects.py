@@ -158,7 +158,8 @@ def slip_finding(drive: str, slip: MountSlip) -> Finding | None:
     else:
         verb = "slips" if contradiction else "may slip"
         who = " or ".join(f"'{name}'" for name in (first, *slip.others))
-        size = f"it is {_moved(slip)}"
+        # What no other LiDAR tells has the errors of the motion data, its time too.
+        size = f"it is {'roughly ' if slip.alone else ''}{_moved(slip)}"
         if slip.others:
             size = f"the drive does not tell which; if it is '{first}', {size}"
         sentence = (

@@ -124,8 +124,7 @@ def clock_findings(
     explains as much. Clocks that are all right by that are compared with each other: of this the
     motion data's own errors are no part, and a millisecond shows.
     """
-    suspects = calibration.suspects
-    if suspects and suspects[0].sigmas > CONTRADICTION_SIGMAS:
+    if _has_culprit(calibration):
         return ()
     terms = [t for t in terms if t.slip is None or t.slip.sigmas <= CONTRADICTION_SIGMAS]
     inertial = [
@@ -147,6 +146,12 @@ def clock_findings(
     return found or _apart(names, terms)
 
 
+def _has_culprit(calibration: Calibration) -> bool:
+    """Whether the first suspect of the graph explains a contradiction by itself."""
+    suspects = calibration.suspects
+    return bool(suspects) and suspects[0].sigmas > CONTRADICTION_SIGMAS
+
+
 def slip_findings(
     names: Sequence[str], terms: Sequence[StructureTerm], calibration: Calibration
 ) -> tuple[Finding, ...]:
@@ -154,8 +159,7 @@ def slip_findings(
 
     `names` are of the drives.
     """
-    suspects = calibration.suspects
-    if suspects and suspects[0].sigmas > CONTRADICTION_SIGMAS:
+    if _has_culprit(calibration):
         return ()
     found = [slip_finding(names[t.drive], t.slip) for t in terms if t.slip is not None]
     return tuple(finding for finding in found if finding is not None)
@@ -256,7 +260,7 @@ def ranked_with(calibration: Calibration, findings: Sequence[Finding]) -> Calibr
     may be what its culprit causes, and changes nothing.
     """
     suspects = calibration.suspects
-    if not suspects or suspects[0].sigmas > CONTRADICTION_SIGMAS:
+    if not suspects or _has_culprit(calibration):
         return calibration
     # The most significant one of each input.
     contradicting = sorted(

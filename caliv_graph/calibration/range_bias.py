@@ -23,6 +23,7 @@ from caliv_graph.config.range_errors import (
     OFFSETS_M,
     SizePrior,
     flat,
+    growth,
     incidence_prior,
     log_normal,
     offset_prior,
@@ -35,6 +36,8 @@ from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.registration.heights import LEAST_SIGMA_M
 from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import JointRegistration
+from caliv_graph.registration.surfels import GRAZING
+from caliv_graph.structure.elimination import marginal
 
 TYPICAL_SMOOTH = 0.5
 """Median of the prior of the smooth errors' sigma, over the roughness: what repeated scans of the
@@ -171,7 +174,7 @@ def _of_placement(
     views = beams / np.linalg.norm(beams, axis=1)[:, None]
     middles = _turned(R, clouds.centres) + t
     incidence = np.zeros((clouds.count, 6, clouds.lidars, 2))
-    incidence[each, :, clouds.lidar] = _by_incidence(quadratic)
+    incidence[each, :, clouds.lidar] = _by_incidence(quadratic, t, state.mixture.normals_target)
     roughness = np.sqrt(np.maximum(state.noise.roughness_m2 - LEAST_SIGMA_M**2, 0.0))
     smooth = [np.zeros((clouds.count, 6, 0))]
     for a in np.flatnonzero(roughness > 0.0).tolist():
@@ -195,17 +198,46 @@ def _turned(R: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("jab,jb->ja", R, vectors))
 
 
-def _by_incidence(quadratic: ShapeQuadratic) -> Array:
+def _by_incidence(quadratic: ShapeQuadratic, t: Array, normals: Array) -> Array:
     """(J, 6, 2) motion of each cloud that growths of its ranges by a metre seem to be.
 
     The one that fits best by the weights of the registration, given the shape: what a cloud shows
-    of its motion is what such ranges move.
+    of its motion is what such ranges move. Sensors are at t (J, 3), `normals` (K, 3) the surfels'.
     """
     blocks = quadratic.blocks
     ridge = HARDLY_SHOWN * np.trace(blocks, axis1=1, axis2=2) + 1e-9
-    return np.asarray(
-        np.linalg.solve(blocks + ridge[:, None, None] * np.eye(6), quadratic.incidence)
-    )
+    pulled = _pulled_by_incidence(quadratic.moments[..., :4], t, normals)
+    return np.asarray(np.linalg.solve(blocks + ridge[:, None, None] * np.eye(6), pulled))
+
+
+def _pulled_by_incidence(sums: Array, t: Array, normals: Array) -> Array:
+    """(J, 6, 2) what the gradients given the shape lose by a metre of each `growth` of the ranges.
+
+    A range that is too long by that puts its point its cosine times that behind the surface. It
+    pulls as any residual does: most where the beams graze, as their noise is along them.
+
+    Args:
+        sums: (J, K, 4) of the weights w and of w y of the points of a cloud and surfel.
+        t: (J, 3) the sensors.
+        normals: (K, 3) of the surfels.
+    """
+    # A cloud touches a third of the surfels.
+    cloud, surfel = np.nonzero(sums[..., 0] > 0.0)
+    weight, *places = sums[cloud, surfel].T
+    n, origin = normals.T[:, surfel], t.T[:, cloud]
+    beams = [places[a] - weight * origin[a] for a in range(3)]
+    away = np.sqrt(beams[0] ** 2 + beams[1] ** 2 + beams[2] ** 2)
+    facing = -(n[0] * beams[0] + n[1] * beams[1] + n[2] * beams[2])
+    # A normal is not known better than what is taken for grazing.
+    cosine = np.clip(facing / np.maximum(away, np.finfo(float).tiny), GRAZING, 1.0)
+    arms = [places[b] * n[c] - places[c] * n[b] for b, c in ((1, 2), (2, 0), (0, 1))]
+    parts = [*arms, *(weight * n)]
+    out = np.empty((len(sums), 6, 2))
+    for kind, of_kind in enumerate(growth(cosine).T):
+        behind = -cosine * of_kind
+        for axis, part in enumerate(parts):
+            out[:, axis, kind] = np.bincount(cloud, behind * part, len(sums))
+    return out
 
 
 def _root_of_views(views: Array) -> Array:
@@ -314,15 +346,10 @@ def _of_each_lidar(
         for lidar in range(len(own_m)):
             sigmas[column >= 0] = own_m[biases.lidar]
             own, others = np.flatnonzero(column == lidar), np.flatnonzero(column != lidar)
-            across = information[np.ix_(others, own)] * sigmas[others, None]
-            known = np.eye(len(others)) + sigmas[others, None] * (
-                information[np.ix_(others, others)] * sigmas[others]
-            )
-            root = scipy.linalg.cho_factor(known, lower=True)
-            left = information[np.ix_(own, own)] - across.T @ scipy.linalg.cho_solve(root, across)
-            pulled = across.T @ scipy.linalg.cho_solve(root, sigmas[others] * pull[others])
-            kinds = np.zeros(len(own), np.int64)
-            weights = size_weights(left, pull[own] - pulled, kinds, (prior,))
+            known = information.copy()
+            known[others, others] += sigmas[others] ** -2.0
+            left = marginal(known, pull, own, others)
+            weights = size_weights(*left, np.zeros(len(own), np.int64), (prior,))
             own_m[lidar] = math.sqrt(weights @ prior.sigmas**2)
     return own_m
 

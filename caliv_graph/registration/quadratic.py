@@ -14,7 +14,6 @@ from functools import partial
 import numpy as np
 
 from caliv_graph.common.cores import parts, shared_map
-from caliv_graph.config.range_errors import growth
 from caliv_graph.geometry.se3 import cross, skew, tangent_axes
 from caliv_graph.products import Array, Mixture
 from caliv_graph.registration.clouds import CloudStack
@@ -32,7 +31,6 @@ from caliv_graph.registration.moments import (
     scatter_about,
     to_target,
 )
-from caliv_graph.registration.surfels import GRAZING
 
 ORIENTATION_PARTS = 2
 """Parts in which the information lost to the components' orientations is summed. The same on any
@@ -63,8 +61,6 @@ class ShapeQuadratic:
 
     Attributes:
         blocks: (J, 6, 6) information of each cloud given the shape.
-        incidence: (J, 6, 2) what `gradient_given_shape` loses by a metre of each growth of the
-            ranges with the incidence (`config/range_errors.py:growth`).
         gradient: (J, 6) g.
         gradient_given_shape: (J, 6) the same where the shape is held: that of `blocks`.
         across: (K', 6 J) roots of the loss to the places of the surfels: across the surface of all,
@@ -83,7 +79,6 @@ class ShapeQuadratic:
     """
 
     blocks: Array
-    incidence: Array
     gradient: Array
     gradient_given_shape: Array
     across: Array
@@ -258,7 +253,6 @@ def shape_quadratic(
     gradient[:, :3] += by_normals @ towards
     quadratic = ShapeQuadratic(
         blocks=blocks,
-        incidence=_by_incidence(points, t, n),
         gradient=gradient,
         gradient_given_shape=given_shape,
         across=_lost(roots, sums),
@@ -302,33 +296,6 @@ def _given_shape(
     gradient[:, :3] += who.levers
     blocks = (np.swapaxes(moments, 1, 2) @ halves).reshape(count, 60) @ _BLOCKS
     return blocks.reshape(count, 6, 6), np.asarray(gradient)
-
-
-def _by_incidence(points: Array, t: Array, normals: Array) -> Array:
-    """`ShapeQuadratic.incidence`, of moments of points (J, K, 10), sensors at t and surfels.
-
-    A range that is too long by `growth` puts its point its cosine times that behind the surface.
-    It pulls as any residual does: most where the beams graze, as their noise is along them.
-    """
-    clouds, components = len(points), len(normals)
-    # A cloud touches a third of the surfels.
-    cell = np.flatnonzero(points[..., 0].ravel() > 0.0)
-    cloud, surfel = np.divmod(cell, components)
-    weight, *sums = points.reshape(-1, 10)[cell, :4].T
-    n, origin = normals.T[:, surfel], t.T[:, cloud]
-    beams = [sums[a] - weight * origin[a] for a in range(3)]
-    away = np.sqrt(beams[0] ** 2 + beams[1] ** 2 + beams[2] ** 2)
-    facing = -(n[0] * beams[0] + n[1] * beams[1] + n[2] * beams[2])
-    # A normal is not known better than what is taken for grazing.
-    cosine = np.clip(facing / np.maximum(away, np.finfo(float).tiny), GRAZING, 1.0)
-    arms = [sums[b] * n[c] - sums[c] * n[b] for b, c in ((1, 2), (2, 0), (0, 1))]
-    parts = [*arms, *(weight * n)]
-    out = np.empty((clouds, 6, 2))
-    for kind, of_kind in enumerate(growth(cosine).T):
-        behind = -cosine * of_kind
-        for axis, part in enumerate(parts):
-            out[:, axis, kind] = np.bincount(cloud, behind * part, clouds)
-    return out
 
 
 def _lost(roots: Sequence[Array], sums: Sequence[Array]) -> Array:

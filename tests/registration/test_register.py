@@ -475,7 +475,6 @@ def quadratic_of(minima: Array, information: Array) -> ShapeQuadratic:
     gradient = -np.einsum("jab,jb->ja", information, minima)
     return ShapeQuadratic(
         blocks=information,
-        incidence=np.zeros((len(minima), 6, 2)),
         gradient=gradient,
         gradient_given_shape=gradient,
         across=np.zeros((1, 6 * len(minima))),

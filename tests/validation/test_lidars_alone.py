@@ -69,7 +69,7 @@ def few_points() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def found() -> Validation:
     """Stamps of their own; the calibration is right in S2S alone."""
-    drive = room(6.5, phase_s={"b": 0.05})
+    drive = room(5.5, phase_s={"b": 0.05})
     return validate(drive, calibration(), config_of(), SilentProgress())
 
 
@@ -102,7 +102,7 @@ def test_a_lidar_that_is_turned_is_contradicted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Stamps in common.
-    monkeypatch.setattr("caliv_graph.readers.open_recording", lambda *_: room(6.0))
+    monkeypatch.setattr("caliv_graph.readers.open_recording", lambda *_: room(5.5))
     wrong, config = tmp_path / "wrong.yaml", tmp_path / "config.yaml"
     write_calibration(calibration(b_turned_rad=6e-3), wrong)
     config.write_text(dump_config(config_of()))

@@ -76,7 +76,7 @@ def standing(*places: tuple[float, float, float], phase_s: float = 0.0, seed: in
     )
     recording = KeptDrive(scenario, seed)
     raw = config_of(recording, has_bag=True)
-    raw |= {"registration": {"components": 150, "max_points": 120}}
+    raw |= {"registration": {"components": 100, "max_points": 100}}
     # The simulated ranges have no bias; one of some millimetres, which real ones may have, would
     # leave the yaw of LiDARs that stand still to 2 mrad.
     raw |= {"noise": {**raw.get("noise", {}), "lidar_range_bias_m": 0.001}}

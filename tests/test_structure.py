@@ -87,6 +87,14 @@ def by_target() -> Calibration:
 
 
 @cache
+def by_target_and_walls() -> CalibrationRun:
+    """By the target, and structure that knows how all LiDARs lie to each other."""
+    with pytest.MonkeyPatch.context() as patch:
+        structure(patch, Structure(arc().truth, pairs=True))
+        return run_on(arc())
+
+
+@cache
 def by_walls() -> tuple[CalibrationRun, Structure]:
     """By structure that knows where all LiDARs are, without a target."""
     with pytest.MonkeyPatch.context() as patch:
@@ -238,15 +246,12 @@ def test_where_none_is_found_a_warning_says_so(
         run_on(sparser().asked(target=(empty,)))
 
 
-def test_a_lidar_that_only_sees_structure_is_calibrated_by_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_lidar_that_only_sees_structure_is_calibrated_by_it() -> None:
     without = by_target()
     assert not without.lidars["right"].has_data
     assert without.unmet
 
-    structure(monkeypatch, Structure(arc().truth, pairs=True))
-    run = run_on(arc())
+    run = by_target_and_walls()
 
     right = run.calibration.lidars["right"]
     assert (right.saw_target, right.has_data) == (False, True)
@@ -259,8 +264,12 @@ def test_a_lidar_that_only_sees_structure_is_calibrated_by_it(
     assert (np.abs(off) < 6.0 * np.array([3e-4] * 3 + [3e-3] * 3)).all()
 
 
-def test_a_drive_without_a_target_counts_beside_one_that_has_one(walls: Structure) -> None:
+def test_a_drive_without_a_target_counts_beside_one_that_has_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Its structure and its ground, at poses that are kept for them."""
+    alone = by_target_and_walls().calibration
+    structure(monkeypatch, Structure(arc().truth, pairs=True))
 
     class Elsewhere(ForwardingRecording):
         """The same drive at another place of the map, far from the target's region."""
@@ -287,8 +296,7 @@ def test_a_drive_without_a_target_counts_beside_one_that_has_one(walls: Structur
     assert {g.stamp_ns for g in run.record.grounds if g.drive == 1} <= set(kept)
     assert any(g.drive == 1 for g in run.record.grounds)
     both = run.calibration
-    alone = run_on(arc()).calibration
-    # What `Structure` says of each LiDAR is said twice.
+    # What `Structure` says of each LiDAR against the others is said twice.
     for name in ("front", "rear", "right"):
         sigmas = [np.sqrt(np.diag(c.lidars[name].cov)) for c in (both, alone)]
         assert (sigmas[0] < 0.95 * sigmas[1]).any(), name

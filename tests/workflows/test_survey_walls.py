@@ -26,7 +26,7 @@ from caliv_graph.workflows.survey import Survey, survey_observations
 from tests.drives_with_chair import paper_lidar, paper_scenario
 from tests.kept import KeptDrive
 
-STRAIGHT = StraightDrive(duration_s=11.0)
+STRAIGHT = StraightDrive(duration_s=9.0)
 
 
 def wall(x_m: float, y_m: float, yaw_deg: float, length_m: float, seed: int) -> WallModel:

@@ -24,7 +24,7 @@ from caliv_graph.structure.thinning import FEW_SCANS
 from tests.structure.test_solve import problem_of, solve
 from tests.structure.yards import STEP_NS, figure_eight, yard
 
-POSES = 125
+POSES = 100
 
 
 def test_a_moved_prior_is_eliminated_as_from_the_joint_quadratic() -> None:

@@ -33,7 +33,7 @@ from caliv_graph.report.folder import write_result
 from caliv_graph.report.tables import calibration_table
 from caliv_graph.results.calibration_file import read_calibration
 from caliv_graph.results.run import CalibrationRun
-from caliv_graph.uncertainty.pairs import pair_determined
+from caliv_graph.uncertainty.pairs import pair_determined, sigmas_s2s
 from caliv_graph.workflows.repeatability import split_halves
 from caliv_graph.workflows.survey import survey
 from tests.drives_with_chair import ARC, QUICK, ChairDrive, paper_lidar, paper_scenario, simulated
@@ -296,10 +296,13 @@ def test_a_drive_without_a_target_counts_beside_one_that_has_one(
     assert {g.stamp_ns for g in run.record.grounds if g.drive == 1} <= set(kept)
     assert any(g.drive == 1 for g in run.record.grounds)
     both = run.calibration
-    # What `Structure` says of each LiDAR against the others is said twice.
     for name in ("front", "rear", "right"):
         sigmas = [np.sqrt(np.diag(c.lidars[name].cov)) for c in (both, alone)]
         assert (sigmas[0] < 0.95 * sigmas[1]).any(), name
+    # What `Structure` says of a LiDAR against the first, which nothing else sees, is said twice.
+    x, y, yaw = 3, 4, 2
+    twice, once = (sigmas_s2s(c, "right", "front")[[yaw, x, y]] for c in (both, alone))
+    assert (twice < 0.85 * once).all(), twice / once
     assert survey(drives, arc().config, NO_PROGRESS).unmet == ()
 
 

@@ -120,14 +120,19 @@ def estimate_with_noise(
     if not used and structure.patches:
         with threadpool_limits(limits=1):
             with progress.stage("estimating the noise of the sensors", None):
-                guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
-                told = structure.slow_errors(trajectories, guesses, {}, config)
+                start: Mapping[str, gtsam.Pose3]
+                start = {name: lidar.guess() for name, lidar in config.lidars.items()}
+                before = tuple(trajectories)
+                trajectories, walls = structure.about_walls(before, start, {}, config)
+                grounds = with_rates_of(grounds, before, trajectories)
+                start = walls.T_vehicle_lidar or start
+                told = structure.slow_errors(trajectories, start, {}, config)
                 noise = noise_of_motion(trajectories, config.noise, told.of_drives)
-                start = told.T_vehicle_lidar or guesses
+                start = told.T_vehicle_lidar or start
                 poses, stamps_ns = structure.pose_errors(trajectories, start, config)
                 pose_noise = noise_by_structure(poses, stamps_ns, trajectories, config)
                 start = poses.T_vehicle_lidar or start
-                told = told if told.T_vehicle_lidar else poses
+                told = next((of for of in (told, poses) if of.T_vehicle_lidar), walls)
                 trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
             solved = solve_structure_and_ground(
                 trajectories, config, progress, grounds, structure, noise, told, pose_noise
@@ -159,9 +164,14 @@ def _estimate(
         rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
         extrinsics = problem.extrinsics(rough.state.values)
-        start = rough_extrinsics(rough.state)
+        start: Mapping[str, gtsam.Pose3] = rough_extrinsics(rough.state)
+        before = tuple(trajectories)
+        trajectories, walls = structure.about_walls(before, start, extrinsics, config)
+        grounds = with_rates_of(grounds, before, trajectories)
+        start = walls.T_vehicle_lidar or start
         told = structure.slow_errors(trajectories, start, extrinsics, config)
-        noise = estimated_noise(rough.state, rough.registrations, trajectories, told.of_drives)
+        told = told if told.T_vehicle_lidar else walls
+        noise = estimated_noise(rough.state, rough.registrations, before, told.of_drives)
         trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
         problem = pose_problem(observations, trajectories, config, noise, kept_ns=kept)
     times = {"registration": rough.registration_s, "graph": rough.graph_s}

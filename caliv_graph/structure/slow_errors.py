@@ -107,6 +107,11 @@ def seeing_lidars(found: Solved) -> dict[str, gtsam.Pose3]:
     return {patches.lidars[i]: found.state.T_vehicle_lidar[i] for i in seeing}
 
 
+def poses_found(found: Solved, prior: PosePrior) -> tuple[Array, Array]:
+    """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) of a solved drive, at those of `prior`."""
+    return found.state.R_map_vehicle, found.state.t_map_vehicle
+
+
 def told_of_poses(found: Solved, prior: PosePrior, chosen: IntArray) -> tuple[Array, Array]:
     """Information (6 k, 6 k) and gradient (6 k,) on k chosen poses, without their prior.
 

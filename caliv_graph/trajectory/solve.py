@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gtsam
@@ -79,15 +80,22 @@ def solve(
     dropped: IntArray,
     kernel: str,
     tolerance: float = ERROR_TOLERANCE,
+    held: Sequence[gtsam.NonlinearFactor] = (),
 ) -> Estimate:
     """Builds and solves the graph until its biases are those it was built with.
 
     The GNSS fixes of indices `dropped` (k,) are left out; `kernel` is the robust kernel of the
-    others. `tolerance` is the relative decrease of the error at which a solve stops.
+    others. `tolerance` is the relative decrease of the error at which a solve stops. `held` are
+    further factors, which the graph of the result is without.
     """
     for _ in range(MAX_PASSES):
         graph = build_graph(data, nodes, states, dropped, kernel)
-        values = optimise(graph.factors, to_values(states, data), len(nodes), tolerance)
+        # Its factors are shared: those of Python cannot be cloned.
+        factors = gtsam.NonlinearFactorGraph()
+        factors.push_back(graph.factors)
+        for factor in held:
+            factors.push_back(factor)
+        values = optimise(factors, to_values(states, data), len(nodes), tolerance)
         found = from_values(values, len(nodes), data)
         gyro_change = np.abs(found.gyro_bias - states.gyro_bias).max()
         force_change = np.abs(found.force_bias - states.force_bias).max()

@@ -25,8 +25,12 @@ def with_parameters(
     more = tuple(UncertainParameter(p) for p in parameters if p.name not in known)
     if not more and smoothed.chain_nodes is None:
         return smoothed
-    every = (*smoothed.parameters, *more)
-    estimate = smoothed.estimate()
+    return linearised(replace(smoothed, parameters=(*smoothed.parameters, *more)))
+
+
+def linearised(smoothed: SmoothedTrajectory) -> SmoothedTrajectory:
+    """The trajectory with the chain of its motion data at its states, of all nodes."""
+    every, estimate = smoothed.parameters, smoothed.estimate()
     columns = columns_of(smoothed, estimate, [p.parameter for p in every])
     linear = estimate.graph.factors.linearize(estimate.values)
     if smoothed.correlated:
@@ -36,4 +40,4 @@ def with_parameters(
         )
     else:
         chain = chain_of(linear, len(smoothed.nodes_ns), smoothed.data.yaw_bias, columns)
-    return replace(smoothed, chain=chain, chain_nodes=None, parameters=every)
+    return replace(smoothed, chain=chain, chain_nodes=None)

@@ -57,6 +57,7 @@ class Row:
         runs: default number of runs.
         limits: of the RMSE per kind of quantity (S2S, S2V): x y z in mm, roll pitch yaw in mrad.
         channels: whether each channel has a range and a direction of its own.
+        fixes: whether there are GNSS and orientation; else an IMU with biases, and speeds.
         must_fail: whether there must be no result: exit code 2 or 3.
     """
 
@@ -68,6 +69,7 @@ class Row:
     runs: int = 20
     limits: Mapping[str, SIX] = field(default_factory=dict)
     channels: bool = False
+    fixes: bool = True
     must_fail: bool = False
 
 
@@ -131,6 +133,17 @@ ROWS: Mapping[str, Row] = {
         "yard",
         channels=True,
     ),
+    "yard_speed": Row(
+        "yard, figure-eight, walls and ground, IMU and speeds alone",
+        "yard",
+        fixes=False,
+    ),
+    "yard_speed_chair": Row(
+        "yard, figure-eight, walls, ground and chair, IMU and speeds alone",
+        "yard",
+        chair=True,
+        fixes=False,
+    ),
     "street": Row("street, parallel fronts and one crossing", "street"),
     "car_park": Row("car park, rows of cars and few walls", "car_park"),
     "field": Row("field, hedges only: no result", "field", must_fail=True),
@@ -158,8 +171,24 @@ def scenario_of(row: str) -> Scenario:
     if asked.lidars != "two":
         changes["lidars"] = _lidars(asked.lidars, base.lidars["front"])
         changes["reference"] = "front"
+    if not asked.fixes:
+        changes |= _without_fixes(base)
     scenario = base.model_copy(update={**changes, "world": world})
     return _with_channel_errors(scenario) if asked.channels else scenario
+
+
+def _without_fixes(scenario: Scenario) -> dict[str, Any]:
+    """An IMU of a mobile robot, whose bias turns the heading by 0.3 rad within the drive."""
+    imu = scenario.imu.model_copy(
+        update={
+            "rate_hz": 200.0,
+            "gyroscope_sigma_rad_s": 0.002,
+            "gyroscope_bias_sigma_rad_s": 0.005,
+            "accelerometer_bias_sigma_m_s2": 0.05,
+            "orientation": scenario.imu.orientation.model_copy(update={"enabled": False}),
+        }
+    )
+    return {"imu": imu, "gnss": scenario.gnss.model_copy(update={"enabled": False})}
 
 
 def _with_channel_errors(scenario: Scenario) -> Scenario:

@@ -15,6 +15,7 @@ import gtsam
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
+from caliv_graph.calibration.drift import about_walls
 from caliv_graph.calibration.given_noise import noise_by_structure
 from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.ground_floors import with_floors
@@ -123,7 +124,7 @@ def estimate_with_noise(
                 start: Mapping[str, gtsam.Pose3]
                 start = {name: lidar.guess() for name, lidar in config.lidars.items()}
                 before = tuple(trajectories)
-                trajectories, walls = structure.about_walls(before, start, {}, config)
+                trajectories, walls = about_walls(before, structure, start, {}, config)
                 grounds = with_rates_of(grounds, before, trajectories)
                 start = walls.T_vehicle_lidar or start
                 told = structure.slow_errors(trajectories, start, {}, config)
@@ -166,7 +167,7 @@ def _estimate(
         extrinsics = problem.extrinsics(rough.state.values)
         start: Mapping[str, gtsam.Pose3] = rough_extrinsics(rough.state)
         before = tuple(trajectories)
-        trajectories, walls = structure.about_walls(before, start, extrinsics, config)
+        trajectories, walls = about_walls(before, structure, start, extrinsics, config)
         grounds = with_rates_of(grounds, before, trajectories)
         start = walls.T_vehicle_lidar or start
         told = structure.slow_errors(trajectories, start, extrinsics, config)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 
 import gtsam
@@ -36,10 +36,8 @@ from caliv_graph.structure.slow_errors import (
     told_of_errors,
     told_of_poses,
 )
-from caliv_graph.trajectory.about_poses import about_poses
 from caliv_graph.trajectory.effects import poses_and_gain
 from caliv_graph.trajectory.error_likelihood import likelihood_end_ns
-from caliv_graph.trajectory.imu import log_so3
 from caliv_graph.trajectory.select import GivenTrajectory, VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -59,16 +57,6 @@ LOOSE = PoseNoise(
 )
 """Noise of given poses under which structure is solved before it is known: as much as poses are
 worth using, so that it does not pass for relief of the walls."""
-
-DRIFT_SIGMA_RAD = 0.02
-"""1 sigma of the heading, relative to the start, from which motion data are linearised where walls
-put the vehicle: by then lengths err by 2e-4 of themselves, a velocity of 2 m/s by 0.4 mm/s."""
-
-DRIFT_LEFT_RAD = 0.005
-"""Turn of a pose from where the motion data were linearised at which they stay."""
-
-DRIFT_ROUNDS = 3
-"""Times at most that they are linearised anew: one makes 1 mrad of a heading 0.1 rad off."""
 
 StructureTerms = Callable[
     [
@@ -191,55 +179,36 @@ class StructureEvidence:
             asked.append(_Asked(used, prior, partial(told_of_errors, gain=gain), trajectory))
         return self._told(asked, start, held, config)
 
-    def about_walls(
+    def poses(
         self,
         trajectories: Sequence[VehicleTrajectory],
+        drives: Collection[int],
         start: Mapping[str, gtsam.Pose3],
         held: Mapping[str, gtsam.Pose3],
         config: Config,
-    ) -> tuple[tuple[VehicleTrajectory, ...], ToldErrors]:
-        """Trajectories whose heading drifts, linearised where their structure puts the vehicle.
+    ) -> tuple[ToldErrors, dict[int, IntArray]]:
+        """Where the structure of some smoothed drives puts the vehicle; and at which stamps.
 
-        Without fixes or orientations the heading drifts by tenths of a radian. Velocities turn with
-        it, and a Gaussian on poses does not know: straight lines in its coordinates are none there.
-        `start` and `held` as for `slow_errors`; the other trajectories stay as they are.
+        `start` and `held` as for `slow_errors`. Of each drive R_map_vehicle (m, 3, 3) and
+        t_map_vehicle (m, 3).
 
         Raises:
             SolveError: it could not be solved.
         """
-        now, told = list(trajectories), NOTHING_TOLD
-        if self.errors is None:
-            return tuple(now), told
-        left = [of for of in self.patches if _drifts(now[of.drive])]
         heave_m = config.noise.heave_m or HEAVE_SIGMA_M
-        for _ in range(DRIFT_ROUNDS):
-            asked = []
-            for patches in left:
-                trajectory = now[patches.drive]
-                assert isinstance(trajectory, SmoothedTrajectory)
-                used = scans_for_errors(patches, int(patches.stamps_ns.max(initial=0)))
-                if len(used.scan):
-                    stamps = np.unique(used.stamps_ns)
-                    prior = plain_prior(trajectory.joint(stamps), stamps, heave_m)
-                    asked.append(_Asked(used, prior, poses_found, trajectory))
-            found = self._told(asked, start, held, config)
-            told = found if found.T_vehicle_lidar else told
-            start, left = found.T_vehicle_lidar or start, []
-            for of in asked:
-                drive = of.patches.drive
-                if drive not in found.of_drives:
-                    continue
-                stamps, (R, t) = of.prior.stamps_ns, found.of_drives[drive]
-                before = np.array([T.rotation().matrix() for T in of.prior.T_map_vehicle])
-                turn = log_so3(np.swapaxes(before, 1, 2) @ R)
-                if np.linalg.norm(turn, axis=1).max() > DRIFT_LEFT_RAD:
-                    trajectory = now[drive]
-                    assert isinstance(trajectory, SmoothedTrajectory)
-                    now[drive] = about_poses(trajectory, stamps, R, t)
-                    left.append(next(of for of in self.patches if of.drive == drive))
-            if not left:
-                break
-        return tuple(now), replace(told, of_drives={})
+        asked, stamps_ns = [], {}
+        for patches in self.patches if drives else ():
+            trajectory = trajectories[patches.drive]
+            if patches.drive not in drives or not isinstance(trajectory, SmoothedTrajectory):
+                continue
+            used = scans_for_errors(patches, int(patches.stamps_ns.max(initial=0)))
+            if not len(used.scan):
+                continue
+            stamps_ns[patches.drive] = stamps = np.unique(used.stamps_ns)
+            prior = plain_prior(trajectory.joint(stamps), stamps, heave_m)
+            asked.append(_Asked(used, prior, poses_found, trajectory))
+        told = self._told(asked, start, held, config)
+        return told, {drive: stamps_ns[drive] for drive in told.of_drives}
 
     def pose_errors(
         self,
@@ -280,8 +249,7 @@ class StructureEvidence:
         config: Config,
     ) -> ToldErrors:
         """The answers of the drives that are asked."""
-        assert self.errors is not None
-        if not asked:
+        if not asked or self.errors is None:
             return NOTHING_TOLD
         answers, T_vehicle_lidar = self.errors(
             [of.patches for of in asked],
@@ -382,15 +350,6 @@ class StructureEvidence:
             # A plane alone does not make a LiDAR part of a calibration: a target has to.
             on_planes=frozenset((o.drive, o.lidar) for o in state.grounds if o.lidar in placed),
         )
-
-
-def _drifts(trajectory: VehicleTrajectory) -> bool:
-    """Whether motion data, without fixes or orientations, leave the heading of a drive wide."""
-    return (
-        isinstance(trajectory, SmoothedTrajectory)
-        and not (trajectory.correlated or trajectory.open_kinds)
-        and bool(trajectory.pose_sigmas[2] > DRIFT_SIGMA_RAD)
-    )
 
 
 def rough_extrinsics(state: SolveState) -> dict[str, gtsam.Pose3]:

@@ -39,9 +39,12 @@ from caliv_graph.uncertainty.suspects import (
 DRIFT_WAVES = 2
 """Half waves over the drive, of one and two: what is faster is noise to the fit of the noise."""
 
-GUESS_SCALE = np.array([0.1] * 3 + [1.0] * 3)
-"""Of a guess and of given poses' frame, rad and m: a direction that is less well determined is left
-out of the test."""
+GUESS_SCALE = np.array([0.05] * 3 + [0.3] * 3)
+"""Of a guess, rad and m: a direction that is less well determined is left out of the test. Strips
+are 2 m wide: what ground alone says of x, y and yaw, to a metre, holds for no shift of metres."""
+
+FRAME_SCALE = np.array([0.1] * 3 + [1.0] * 3)
+"""The same of the frame of given poses."""
 
 MOUNT_SCALE = np.array([1e-2] * 3 + [1e-1] * 3)
 """The same of a mount in one part of the drive, rad and m."""
@@ -380,5 +383,5 @@ def _of_given_frame(solution: Solution, trajectories: Sequence[VehicleTrajectory
     if not of.any():
         return []
     columns = np.asarray(np.kron(of[:, None], np.eye(6)), np.float64)
-    candidate = Candidate("poses.frame", np.zeros(6), GUESS_SCALE)
+    candidate = Candidate("poses.frame", np.zeros(6), FRAME_SCALE)
     return [_Block(candidate, poses=columns)]

@@ -140,8 +140,11 @@ class ParameterPrior:
 def motion_term(
     trajectory: SmoothedTrajectory, stamps_ns: Sequence[int], heave_m: float
 ) -> MotionTerm | None:
-    """The term of one drive's wanted poses; None if none of its parameters is uncertain."""
-    if not _uncertain(trajectory):
+    """The term of one drive's wanted poses.
+
+    None if none of its parameters is uncertain, and their mean is the trajectory.
+    """
+    if not (_uncertain(trajectory) or trajectory.elsewhere):
         return None
     joint, values = motion_gaussian(trajectory, stamps_ns, heave_m)
     chart = chart_of(trajectory)

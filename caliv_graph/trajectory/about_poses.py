@@ -59,6 +59,7 @@ def about_poses(
         trajectory=replace(smoothed.trajectory, T_map_vehicle=poses),
         states=estimate.states,
         built_with=estimate.built_with,
+        elsewhere=True,
     )
     del estimate  # its graph
     there = linearised(there)

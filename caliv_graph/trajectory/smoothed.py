@@ -78,7 +78,8 @@ class JointInformation:
 
     Attributes:
         information: (6 m + p, 6 m + p), without the priors of the parameters.
-        gradient: (6 m + p,); of the poses it is zero but for the solver's tolerance.
+        gradient: (6 m + p,); of the poses it is zero but for the solver's tolerance, if
+            the trajectory is not linearised elsewhere.
         T_map_vehicle: the m poses at the estimate.
         parameters: names of the parameters, in order.
     """
@@ -118,6 +119,8 @@ class SmoothedTrajectory:
         correlated: errors of sensors that are correlated over time. States and chain contain them,
             the chain as the last coordinates of every state; the graph does not.
         errors: (n, 3 e) their estimates at the nodes, metres or radians, map axes.
+        elsewhere: the chain is linearised elsewhere than at the estimate of these data
+            (`about_poses`): its gradient is not zero.
         chain_nodes: (m,) indices of the nodes whose states the chain has, ascending, all others
             being eliminated; None: it has all.
     """
@@ -144,6 +147,7 @@ class SmoothedTrajectory:
     parameter_cov: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     correlated: tuple[CorrelatedError, ...] = ()
     errors: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    elsewhere: bool = False
     chain_nodes: IntArray | None = field(default=None, repr=False)
 
     @property

@@ -52,10 +52,14 @@ STEP_FORCE_BIAS_M_S2 = 0.1
 STEP_GYRO_BIAS_RAD_S = 0.01
 
 # Medians of sigma over the drive beyond which the trajectory counts as undetermined: ten times what
-# any sensor set in use leaves, and too much for the target to be found in the map.
+# any sensor set in use leaves, and too much for the target to be found in the map. Walls can tell
+# the heading (`about_poses.py`), where an error of the gyroscope's bias turns it along the drive.
 MAX_TILT_SIGMA_RAD = 0.1
-MAX_YAW_SIGMA_RAD = 0.2
+MAX_YAW_SIGMA_RAD = 1.0
 MAX_POSITION_SIGMA_M = 10.0
+
+LONE_YAW_SIGMA_RAD = 0.2
+"""The same of the heading where no walls tell it."""
 
 
 def solve_from_the_start(data: SmootherInput, nodes: IntArray, states: States) -> States:
@@ -235,14 +239,7 @@ def covariances_of(
     Raises:
         TrajectoryError: the poses are undetermined, or far less certain than is of use.
     """
-    wanting = f"{data.name}: the motion data do not determine "
-    advice = (
-        "orientation in the IMU's messages, GNSS, or velocities, or a drive with curves"
-        if not data.orientation
-        else "GNSS or velocities along the whole drive"
-    )
-    if data.wheels is not None:
-        advice = "GNSS along the whole drive, the heading of two antennas, or an IMU"
+    wanting, advice = f"{data.name}: the motion data do not determine ", _missing_sensors(data)
     try:
         marginals = Marginals(linear, node_ordering(len(states.p_map_imu), data.yaw_bias))
         cov = marginals.covariances([key_imu(i) for i in range(len(states.p_map_imu))])
@@ -253,9 +250,7 @@ def covariances_of(
     cov_map = rotated(R, cov[:, :3, :3])
     sigma = np.median(np.sqrt(np.diagonal(cov_map, axis1=1, axis2=2)), axis=0)
     if sigma[2] > MAX_YAW_SIGMA_RAD:
-        raise TrajectoryError(
-            f"{wanting}heading: its sigma is {math.degrees(sigma[2]):.1f} degrees. Record {advice}"
-        )
+        raise without_heading(data, sigma[2])
     if max(sigma[:2]) > MAX_TILT_SIGMA_RAD:
         raise TrajectoryError(
             f"{wanting}roll and pitch: sigma {math.degrees(max(sigma[:2])):.1f} degrees. Record "
@@ -265,3 +260,21 @@ def covariances_of(
     if position > MAX_POSITION_SIGMA_M:
         raise TrajectoryError(f"{wanting}position: its sigma is {position:.1f} m. Record {advice}")
     return cov, None if yaw_cov is None else math.sqrt(float(yaw_cov[0, 0, 0]))
+
+
+def _missing_sensors(data: SmootherInput) -> str:
+    """What a recording would have to have beside what it has."""
+    if data.wheels is not None:
+        return "GNSS along the whole drive, the heading of two antennas, or an IMU"
+    if data.orientation:
+        return "GNSS or velocities along the whole drive"
+    return "orientation in the IMU's messages, GNSS, or velocities, or a drive with curves"
+
+
+def without_heading(data: SmootherInput, sigma_rad: float) -> TrajectoryError:
+    """The error of a drive whose heading is too uncertain."""
+    return TrajectoryError(
+        f"{data.name}: the motion data do not determine heading: its sigma is "
+        f"{math.degrees(sigma_rad):.1f} degrees, and walls in view of the LiDARs do not tell it. "
+        f"Record {_missing_sensors(data)}"
+    )

@@ -1,0 +1,118 @@
+"""A heading that drifts is linearised where walls put the vehicle, or refused without any."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from caliv_graph.calibration.drift import about_walls
+from caliv_graph.calibration.structure_evidence import NO_STRUCTURE, StructureEvidence
+from caliv_graph.errors import TrajectoryError
+from caliv_graph.products import Array
+from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from tests.trajectory.motions import record, seconds
+from tests.trajectory.test_about_poses import (
+    BIAS_RAD_S,
+    COURSE,
+    SENSORS,
+    WANTED,
+    speeds_alone,
+)
+
+FOUND = {"front": gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0.0, 2.0]))}
+START = {"front": gtsam.Pose3()}
+
+
+@dataclass
+class Walls:
+    """`SlowErrors` that know where the vehicle is; and how often they were asked."""
+
+    asked: list[Sequence[VehicleTrajectory]] = field(default_factory=list)
+
+    def __call__(self, *given: Any) -> tuple[tuple[tuple[Array, Array], ...], Any]:
+        _, priors, _, trajectories, *_ = given
+        self.asked.append(trajectories)
+        true = [COURSE.at(seconds(prior.stamps_ns)) for prior in priors]
+        return tuple((of.R_map_vehicle, of.p_map_vehicle) for of in true), FOUND
+
+
+def patches_of(*drives: int) -> tuple[DrivePatches, ...]:
+    n = len(WANTED) - 2
+    ahead = np.eye(4)
+    ahead[0, 3] = ahead[3, 0] = 5.0
+    return tuple(
+        DrivePatches(
+            drive=drive,
+            lidars=("front",),
+            stamps_ns=WANTED[1:-1],
+            scan_lidar=np.zeros(n, np.int64),
+            scan=np.arange(n),
+            time_s=np.zeros(n),
+            moments=np.tile(ahead, (n, 1, 1)),
+            normal_lidar=np.tile([1.0, 0.0, 0.0], (n, 1)),
+            scatter_m=np.full(n, 0.01),
+        )
+        for drive in drives
+    )
+
+
+@pytest.fixture(scope="module")
+def drifting() -> SmoothedTrajectory:
+    motion, config = speeds_alone()
+    return smooth_trajectory(motion, config, WANTED)
+
+
+def test_walls_tell_the_bias_of_a_drive_whose_heading_drifts(drifting: SmoothedTrajectory) -> None:
+    _, config = speeds_alone()
+    fixed = smooth_trajectory(record(COURSE, SENSORS, 3), config, WANTED)
+    walls = Walls()
+    evidence = StructureEvidence(patches_of(0, 1), errors=walls)
+
+    (with_fixes, without), told = about_walls([fixed, drifting], evidence, START, {}, config)
+
+    assert with_fixes is fixed
+    assert isinstance(without, SmoothedTrajectory)
+    assert np.median(without.states.gyro_bias[:, 2]) == pytest.approx(BIAS_RAD_S, abs=5e-4)
+    # The second time nothing turns any more.
+    assert [len(trajectories) for trajectories in walls.asked] == [1, 1]
+    assert walls.asked[0][0] is drifting
+    assert told.T_vehicle_lidar is FOUND
+    assert not told.of_drives
+
+
+def test_a_known_heading_asks_no_walls(drifting: SmoothedTrajectory) -> None:
+    _, config = speeds_alone()
+    known = replace(drifting, pose_sigmas=np.full(6, 0.015))
+    walls = Walls()
+
+    (same,), told = about_walls(
+        [known], StructureEvidence(patches_of(0), errors=walls), START, {}, config
+    )
+
+    assert same is known
+    assert not walls.asked
+    assert told.T_vehicle_lidar is None
+
+
+def test_a_heading_that_nothing_tells_is_refused(drifting: SmoothedTrajectory) -> None:
+    _, config = speeds_alone()
+    wide = replace(drifting, pose_sigmas=np.full(6, 0.3))
+
+    with pytest.raises(TrajectoryError, match=r"heading: its sigma is 17\.2 degrees, and walls"):
+        about_walls([wide], NO_STRUCTURE, START, {}, config)
+
+    # Of a second drive, too, where only the first has walls.
+    evidence = StructureEvidence(patches_of(0), errors=Walls())
+    with pytest.raises(TrajectoryError, match="walls in view of the LiDARs do not tell it"):
+        about_walls([drifting, wide], evidence, START, {}, config)
+
+    (same,), _ = about_walls([drifting], NO_STRUCTURE, START, {}, config)
+    assert same is drifting

@@ -252,7 +252,11 @@ _REMEDIES = {
         "guesses counts from that frame"
     ),
     "poses.frame": "Check that topics.pose has the poses of the vehicle frame",
-    "poses.drift": "The given poses drift by this range over the drive: use better ones",
+    "poses.drift": (
+        "The given poses drift by this range over the drive: use better ones. Of an odometry, "
+        "record what it is made of: velocities and yaw rate as topics.twist, an IMU if there is "
+        "one; walls in view then tell the heading"
+    ),
     "gnss.drift": "The GNSS positions drift by this range over the drive: use better ones",
     "lidars.*.time_offset": (
         "Check the clocks of the LiDARs against those of IMU and GNSS or of the poses, or set "

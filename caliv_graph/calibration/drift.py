@@ -57,7 +57,7 @@ def about_walls(
 
     Raises:
         SolveError: structure could not be solved.
-        TrajectoryError: a heading is uncertain, and no structure tells it.
+        TrajectoryError: a heading is uncertain, and no structure tells it, or never the same.
     """
     now, told = list(trajectories), NOTHING_TOLD
     left = {drive for drive, trajectory in enumerate(now) if _drifts(trajectory)}
@@ -74,7 +74,7 @@ def about_walls(
             if _turned_rad(trajectory, stamps, R) > LEFT_RAD:
                 now[drive] = about_poses(trajectory, stamps, R, t)
                 left.add(drive)
-    for drive in sorted(untold):
+    for drive in sorted(untold | left):
         trajectory = now[drive]
         if isinstance(trajectory, SmoothedTrajectory):
             sigma_rad = float(trajectory.pose_sigmas[2])

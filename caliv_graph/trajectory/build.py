@@ -28,8 +28,14 @@ from caliv_graph.trajectory.factors import (
 )
 from caliv_graph.trajectory.imu import DeadReckoning, preintegrate
 from caliv_graph.trajectory.inputs import IMU_CLOCK, SmootherInput
-from caliv_graph.trajectory.measurements import NodeOrientations, NodePositions, NodeVelocities
+from caliv_graph.trajectory.measurements import (
+    NodeOrientations,
+    NodePositions,
+    NodeVelocities,
+    nearest_node,
+)
 from caliv_graph.trajectory.nodes import carry_to_nodes
+from caliv_graph.trajectory.standstill import standstills
 from caliv_graph.trajectory.states import States, without_bias
 from caliv_graph.trajectory.wheels import accelerations, level_sigmas, normal_of
 
@@ -37,6 +43,10 @@ GAUGE_M = 1e-4
 GAUGE_RAD = 1e-4
 """1 sigma of the gauge prior on the first pose, without GNSS: far below what any sensor resolves,
 and large enough that the graph stays well conditioned."""
+
+
+UNMEASURED_M_S2 = 1e3
+"""1 sigma of a bias that nothing measures: no information."""
 
 
 @dataclass
@@ -61,7 +71,17 @@ class TrajectoryGraph:
 
 
 KINDS = frozenset(
-    {"imu", "gnss", "orientation", "velocity", "level", "heading", "baseline", "prior"}
+    {
+        "imu",
+        "gnss",
+        "orientation",
+        "velocity",
+        "level",
+        "heading",
+        "baseline",
+        "standstill",
+        "prior",
+    }
 )
 """Kinds of the factors of a trajectory."""
 
@@ -84,6 +104,8 @@ def build_graph(
     carried = carry_to_nodes(data, nodes, dead, kinds)
     if kinds & {"imu", "prior"}:
         _add_imu(graph, data, nodes, states)
+    if "standstill" in kinds:
+        _add_standstills(graph, data, nodes)
     if carried.positions is not None:
         _add_positions(graph, data, carried.positions, dropped, kernel)
     if carried.orientations is not None:
@@ -134,6 +156,18 @@ def _add_imu(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray, state
     model = gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas)
     no_bias = gtsam.imuBias.ConstantBias()
     graph.add("prior", gtsam.PriorFactorConstantBias(key_bias(0), no_bias, model))
+
+
+def _add_standstills(graph: TrajectoryGraph, data: SmootherInput, nodes: IntArray) -> None:
+    """The bias of the gyroscope where the vehicle stands; that of the accelerometer stays free."""
+    for found in standstills(data):
+        if not nodes[0] <= found.middle_ns <= nodes[-1]:
+            continue
+        node = int(nearest_node(nodes, np.array([found.middle_ns]))[0])
+        bias = gtsam.imuBias.ConstantBias(np.zeros(3), found.rate)
+        sigmas = np.concatenate([np.full(3, UNMEASURED_M_S2), found.sigmas])
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        graph.add("standstill", gtsam.PriorFactorConstantBias(key_bias(node), bias, noise))
 
 
 def _add_positions(

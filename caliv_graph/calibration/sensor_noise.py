@@ -271,12 +271,14 @@ def with_noise(
 ) -> list[VehicleTrajectory]:
     """The trajectories, smoothed again where a sensor's error is correlated.
 
-    An error that nothing shows contradicts no stated sigma: those that held still hold.
+    An error that nothing shows contradicts no stated sigma: those that held still hold. Drives
+    that are linearised elsewhere have no sensor with such an error (`drift.py`), and stay.
     """
     open_only = len(noise.opened) == len(noise.correlated)
     out: list[VehicleTrajectory] = []
     for t in trajectories:
-        if noise.correlated and isinstance(t, SmoothedTrajectory) and t.data is not None:
+        again = noise.correlated and isinstance(t, SmoothedTrajectory) and not t.elsewhere
+        if again and isinstance(t, SmoothedTrajectory) and t.data is not None:
             stamps = t.trajectory.stamps_ns
             known: dict[str, float] | None = {} if open_only and not t.data.scales else None
             t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated, known)

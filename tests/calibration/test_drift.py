@@ -11,10 +11,15 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.drift import about_walls
+from caliv_graph.calibration.sensor_noise import usual_noise, with_noise
 from caliv_graph.calibration.structure_evidence import NO_STRUCTURE, StructureEvidence
+from caliv_graph.calibration.vehicle_parameters import motion_term
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array
 from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.trajectory.about_poses import about_poses
+from caliv_graph.trajectory.correlated import CorrelatedError
+from caliv_graph.trajectory.imu import log_so3
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -116,3 +121,40 @@ def test_a_heading_that_nothing_tells_is_refused(drifting: SmoothedTrajectory) -
 
     (same,), _ = about_walls([drifting], NO_STRUCTURE, START, {}, config)
     assert same is drifting
+
+
+def test_other_drives_noise_leaves_it_where_walls_put_it(drifting: SmoothedTrajectory) -> None:
+    """Fixes of another drive err over time: only that drive is smoothed again."""
+    _, config = speeds_alone()
+    fixed = smooth_trajectory(record(COURSE, SENSORS, 3), config, WANTED)
+    true = COURSE.at(seconds(WANTED))
+    there = about_poses(drifting, WANTED, true.R_map_vehicle, true.p_map_vehicle)
+    error = CorrelatedError("gnss", (0.02, 0.02, 0.02), 10.0)
+    noise = replace(usual_noise(config.noise), correlated=(error,))
+
+    again, same = with_noise(noise, [fixed, there])
+
+    assert isinstance(again, SmoothedTrajectory)
+    assert again.correlated == (error,)
+    assert same is there
+
+
+def test_the_graph_has_the_pull_back_of_a_drive_without_uncertain_parameters() -> None:
+    """A Gaussian about the trajectory would take for measured where walls put the vehicle."""
+    sensors = replace(SENSORS, T_vehicle_imu=gtsam.Pose3(), lever_arm=(0.0, 0.0, 0.0))
+    motion, config = speeds_alone(sensors)
+    plain = smooth_trajectory(motion, config, WANTED)
+    true = COURSE.at(seconds(WANTED))
+    stamps = WANTED[::5].tolist()
+    assert motion_term(plain, stamps, 0.01) is None
+
+    there = about_poses(plain, WANTED, true.R_map_vehicle, true.p_map_vehicle)
+
+    term = motion_term(there, stamps, 0.01)
+    assert term is not None
+    assert not term.values
+    step = np.linalg.solve(term.information, term.gradient).reshape(-1, 6)
+    R, _ = plain.poses_at(stamps)
+    turned = log_so3(np.swapaxes(true.R_map_vehicle[::5], 1, 2) @ R)
+    assert np.abs(turned[:, 2]).max() > 0.03
+    assert np.abs(step[:, 2] - turned[:, 2]).max() < 0.1 * np.abs(turned[:, 2]).max()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from threadpoolctl import threadpool_limits
@@ -24,6 +25,9 @@ from caliv_graph.products import (
     TargetObservation,
 )
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from caliv_graph.trajectory.solve import LONE_YAW_SIGMA_RAD
+from caliv_graph.wording.inspection import heading_left_sentence
 from caliv_graph.wording.mounting import placement_sentence
 
 
@@ -35,7 +39,8 @@ class Look:
         observations: the targets' clouds; None if the search stopped.
         findings: values of the config that the raw data contradict, the heading included.
         problems: what stopped the search, a sentence each.
-        notes: where LiDARs without an initial guess were found, a sentence each.
+        notes: where LiDARs without an initial guess were found, and what motion data leave to
+            walls, a sentence each.
         trajectory: of the vehicle; None if it could not be smoothed.
         config: with the mountings that were found; None if none was looked for.
     """
@@ -78,6 +83,7 @@ def _look(recording: Recording, config: Config, progress: Progress) -> Look:
             return Look(None, findings, tuple(problems), notes)
         trajectories = smooth_trajectories([recording], config, [[]], motions)
         (trajectory,) = trajectories
+        notes += _on_heading(recording.name, trajectory)
         config, placements = place_lidars([recording], trajectories, config, progress)
         notes += tuple(map(placement_sentence, placements))
         findings += smoothed_findings([recording], trajectories, motions, config, progress)
@@ -90,3 +96,13 @@ def _look(recording: Recording, config: Config, progress: Progress) -> Look:
         problems.append(error.what if findings and isinstance(error, TargetError) else str(error))
         observations = None
     return Look(observations, findings, tuple(problems), notes, trajectory, config)
+
+
+def _on_heading(name: str, trajectory: VehicleTrajectory) -> tuple[str, ...]:
+    """A sentence on a heading that is refused where no walls tell it."""
+    if not isinstance(trajectory, SmoothedTrajectory):
+        return ()
+    sigma_rad = float(trajectory.pose_sigmas[2])
+    if sigma_rad <= LONE_YAW_SIGMA_RAD:
+        return ()
+    return (heading_left_sentence(name, math.degrees(sigma_rad)),)

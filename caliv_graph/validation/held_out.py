@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
+from caliv_graph.calibration.drift import about_walls
 from caliv_graph.calibration.pose_priors import pose_priors
 from caliv_graph.calibration.sensor_noise import usual_noise
+from caliv_graph.calibration.structure_evidence import StructureEvidence
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
-from caliv_graph.errors import SolveError
+from caliv_graph.errors import SolveError, TrajectoryError
 from caliv_graph.products import Array, BoolArray, Calibration, MotionData, Recording
 from caliv_graph.structure.distances import (
     Measured,
@@ -34,6 +36,7 @@ from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.problem import Problem, first_state, part_of, placed_patches
 from caliv_graph.structure.read import read_patches
 from caliv_graph.structure.relative import relative_problem
+from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.solve import Solved, solve_structure
 from caliv_graph.structure.strips import TILE_M
 from caliv_graph.structure.term import aligned_start, odometry_of, problem_of, usable
@@ -112,9 +115,13 @@ def measure_held_out(
     with progress.stage("calibrating without a third of the structure", None):
         stamps = np.unique(patches.stamps_ns)
         (trajectory,) = smooth_trajectories([recording], config, [stamps], motions)
-        drive = _drive(patches, trajectory, calibration, extrinsics, config)
         try:
-            other = _without(drive, trajectory, config)
+            about = _about_walls(trajectory, patches, extrinsics, config)
+        except (SolveError, TrajectoryError) as error:
+            return _nothing(error.what)
+        drive = _drive(patches, about, calibration, extrinsics, config)
+        try:
+            other = _without(drive, about, config)
         except SolveError as error:
             return _nothing(error.what)
         if other is None:
@@ -132,6 +139,18 @@ def measure_held_out(
         pairs = pair_tests(other.used, extrinsics, cov[first:, first:], calibration.reference)
     found = replace(_found(other, drive.held, measured), pairs=pairs)
     return HeldOutOutcome(found, (), other.used if own else None)
+
+
+def _about_walls(
+    trajectory: VehicleTrajectory, patches: DrivePatches, extrinsics: Extrinsics, config: Config
+) -> VehicleTrajectory:
+    """The trajectory; linearised where walls put the vehicle if its heading drifts.
+
+    By all strips, held-out ones too: where motion data are linearised is no evidence.
+    """
+    structure = StructureEvidence((patches,), errors=slow_errors)
+    (about,), _ = about_walls([trajectory], structure, extrinsics.T_vehicle_lidar, {}, config)
+    return about
 
 
 def _nothing(why: str) -> HeldOutOutcome:

@@ -33,3 +33,11 @@ def untested_guesses_sentence(lidars: Sequence[str]) -> str:
         f"Yaw, x and y of the initial guesses of lidars {names} are not tested here, for no target "
         "is seen: 'caliv-graph calibrate' tests them by walls"
     )
+
+
+def heading_left_sentence(name: str, sigma_deg: float) -> str:
+    """What the motion data of a drive leave to walls."""
+    return (
+        f"{name}: the motion data leave the heading to {sigma_deg:.1f} degrees (1 sigma): "
+        "'caliv-graph calibrate' refuses the drive unless walls in view of the LiDARs tell it"
+    )

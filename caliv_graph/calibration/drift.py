@@ -69,17 +69,19 @@ def about_walls(
         told, start, left = found, found.T_vehicle_lidar, set()
         untold -= stamps_ns.keys()
         for drive, stamps in stamps_ns.items():
-            trajectory, (R, t) = now[drive], found.of_drives[drive]
+            trajectory, (T, sigmas) = now[drive], found.of_drives[drive]
             assert isinstance(trajectory, SmoothedTrajectory)
-            if _turned_rad(trajectory, stamps, R) > LEFT_RAD:
-                now[drive] = about_poses(trajectory, stamps, R, t)
+            if np.median(sigmas) > LONE_YAW_SIGMA_RAD:  # ground, say, tells no heading
+                untold.add(drive)
+            elif _turned_rad(trajectory, stamps, T[:, :3, :3]) > LEFT_RAD:
+                now[drive] = about_poses(trajectory, stamps, T[:, :3, :3], T[:, :3, 3])
                 left.add(drive)
     for drive in sorted(untold | left):
         trajectory = now[drive]
         if isinstance(trajectory, SmoothedTrajectory):
             sigma_rad = float(trajectory.pose_sigmas[2])
             if sigma_rad > LONE_YAW_SIGMA_RAD:
-                raise without_heading(trajectory.data, sigma_rad)
+                raise without_heading(trajectory.data, sigma_rad, walls=_drifts(trajectory))
     return tuple(now), replace(told, of_drives={})
 
 

@@ -189,8 +189,8 @@ class StructureEvidence:
     ) -> tuple[ToldErrors, dict[int, IntArray]]:
         """Where the structure of some smoothed drives puts the vehicle; and at which stamps.
 
-        `start` and `held` as for `slow_errors`. Of each drive R_map_vehicle (m, 3, 3) and
-        t_map_vehicle (m, 3).
+        `start` and `held` as for `slow_errors`. Of each drive T_map_vehicle (m, 4, 4) and 1 sigma
+        (m,) of the headings, rad.
 
         Raises:
             SolveError: it could not be solved.

@@ -81,7 +81,7 @@ def _look(recording: Recording, config: Config, progress: Progress) -> Look:
         findings = raw = raw_findings(motions, config)
         if any(found.severity == "fatal" for found in findings):
             return Look(None, findings, tuple(problems), notes)
-        trajectories = smooth_trajectories([recording], config, [[]], motions)
+        trajectories = smooth_trajectories([recording], config, [[]], motions, by_walls=True)
         (trajectory,) = trajectories
         notes += _on_heading(recording.name, trajectory)
         config, placements = place_lidars([recording], trajectories, config, progress)

@@ -174,7 +174,9 @@ def prepare(
         stamps = _stamps_seen(len(recordings), observations, patches)
         scales = noise_scales(rough)
         del rough  # a graph of its own, which nobody asks any more
-        trajectories = smooth_trajectories(recordings, config, stamps, motions, scales)
+        trajectories = smooth_trajectories(
+            recordings, config, stamps, motions, scales, by_walls=True
+        )
     grounds: Sequence[GroundObservation] = ()
     ground_warnings: Sequence[str] = ()
     others = {patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)}
@@ -250,7 +252,9 @@ def _searched(
     wrong: tuple[Doubt, ...] = ()
     try:
         with progress.stage("smoothing the trajectory", None):
-            rough = smooth_trajectories(recordings, config, [[] for _ in recordings], motions)
+            rough = smooth_trajectories(
+                recordings, config, [[] for _ in recordings], motions, by_walls=True
+            )
         config, placements = place_lidars(recordings, rough, config, progress)
         findings += smoothed_findings(recordings, rough, motions, config, progress)
         if refused is not None:

@@ -108,8 +108,18 @@ def seeing_lidars(found: Solved) -> dict[str, gtsam.Pose3]:
 
 
 def poses_found(found: Solved, prior: PosePrior) -> tuple[Array, Array]:
-    """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) of a solved drive, at those of `prior`."""
-    return found.state.R_map_vehicle, found.state.t_map_vehicle
+    """T_map_vehicle (m, 4, 4) of a solved drive, and 1 sigma (m,) of each heading, rad.
+
+    At the poses of `prior`. The heading is that about the vehicle's z, relative to the map.
+    """
+    m = len(prior.stamps_ns)
+    T = np.tile(np.eye(4), (m, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = found.state.R_map_vehicle, found.state.t_map_vehicle
+    H, _ = with_hold(found.problem, found.state, found.system)
+    columns = np.zeros((len(H), m))
+    columns[6 * np.arange(m) + 2, np.arange(m)] = 1.0
+    half = half_solved(factor_of(H), columns)
+    return T, np.sqrt(np.einsum("km,km->m", half, half))
 
 
 def told_of_poses(found: Solved, prior: PosePrior, chosen: IntArray) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from caliv_graph.trajectory.noise import stated
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
+from caliv_graph.trajectory.solve import LONE_YAW_SIGMA_RAD, without_heading
 
 TWIST_WINDOW_NS = 50_000_000
 """Half the time over which the vehicle's velocity is averaged: that of a sweep at 10 Hz."""
@@ -118,12 +119,15 @@ def smooth_trajectories(
     wanted: Sequence[Sequence[int] | IntArray] | None = None,
     motions: Mapping[int, MotionData] | None = None,
     scales: Sequence[Mapping[str, float] | None] | None = None,
+    *,
+    by_walls: bool = False,
 ) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
     """The trajectory of each drive: given poses (`takes_given_poses`), or smoothed raw sensors.
 
     `wanted` are per drive the stamps at which poses are wanted; None: those of all clouds.
     `motions` are motion data by the recording's index, if they have been read already. `scales` are
-    the noise levels of an earlier smoothing (`noise_scales`); None: estimated.
+    the noise levels of an earlier smoothing (`noise_scales`); None: estimated. `by_walls`: a wide
+    heading is not refused, for walls are to tell it (`calibration.drift`).
 
     Raises:
         TrajectoryError: the data of a drive do not determine its motion.
@@ -137,7 +141,11 @@ def smooth_trajectories(
             out.append(_given(motion, stamps))
         else:
             known = None if scales is None else scales[index]
-            out.append(smooth_trajectory(motion, config, stamps, scales=known))
+            smoothed = smooth_trajectory(motion, config, stamps, scales=known)
+            sigma_rad = float(smoothed.pose_sigmas[2])
+            if sigma_rad > LONE_YAW_SIGMA_RAD and not by_walls:
+                raise without_heading(smoothed.data, sigma_rad)
+            out.append(smoothed)
     return tuple(out)
 
 

@@ -266,15 +266,29 @@ def _missing_sensors(data: SmootherInput) -> str:
     """What a recording would have to have beside what it has."""
     if data.wheels is not None:
         return "GNSS along the whole drive, the heading of two antennas, or an IMU"
+    has_speeds = data.motion.twist is not None
     if data.orientation:
-        return "GNSS or velocities along the whole drive"
+        return "GNSS along the whole drive" if has_speeds else "GNSS or velocities all along"
+    if has_speeds:
+        return "orientation in the IMU's messages, or GNSS and a drive with curves"
     return "orientation in the IMU's messages, GNSS, or velocities, or a drive with curves"
 
 
-def without_heading(data: SmootherInput, sigma_rad: float) -> TrajectoryError:
-    """The error of a drive whose heading is too uncertain."""
+def without_heading(
+    data: SmootherInput, sigma_rad: float, *, walls: bool = False
+) -> TrajectoryError:
+    """The error of a drive whose heading is too uncertain; `walls` in view do not tell it."""
+    not_by_walls, near, stand = "", "", ""
+    if walls:
+        not_by_walls = ", and the walls in view of the LiDARs tell it no better"
+        near = ", or drive where walls are in view all along"
+    if data.motion.twist is not None and not data.orientation and data.positions is None:
+        stand = (
+            ". Speeds of zero tell the gyroscope's bias: stand still for two seconds before and "
+            "after the drive"
+        )
     return TrajectoryError(
         f"{data.name}: the motion data do not determine heading: its sigma is "
-        f"{math.degrees(sigma_rad):.1f} degrees, and walls in view of the LiDARs do not tell it. "
-        f"Record {_missing_sensors(data)}"
+        f"{math.degrees(sigma_rad):.1f} degrees{not_by_walls}. Record {_missing_sensors(data)}"
+        f"{near}{stand}"
     )

@@ -41,6 +41,7 @@ from caliv_graph.structure.solve import Solved, solve_structure
 from caliv_graph.structure.strips import TILE_M
 from caliv_graph.structure.term import aligned_start, odometry_of, problem_of, usable
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation.clouds import Extrinsics
 from caliv_graph.validation.covariances import pose_noise
 from caliv_graph.validation.findings import (
@@ -65,11 +66,13 @@ class HeldOutOutcome:
         sentences: why there is none.
         used: the solve without it, of a drive without motion data: its poses are the best there
             are. Else None.
+        about_walls: the trajectory where walls put the vehicle, if its heading drifts; else None.
     """
 
     found: HeldOutStructure | None
     sentences: tuple[str, ...] = ()
     used: Solved | None = None
+    about_walls: SmoothedTrajectory | None = None
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ def measure_held_out(
         return _nothing("no LiDAR sees flat surfaces")
     with progress.stage("calibrating without a third of the structure", None):
         stamps = np.unique(patches.stamps_ns)
-        (trajectory,) = smooth_trajectories([recording], config, [stamps], motions)
+        (trajectory,) = smooth_trajectories([recording], config, [stamps], motions, by_walls=True)
         try:
             about = _about_walls(trajectory, patches, extrinsics, config)
         except (SolveError, TrajectoryError) as error:
@@ -138,7 +141,8 @@ def measure_held_out(
         first = len(drive.problem.offsets)
         pairs = pair_tests(other.used, extrinsics, cov[first:, first:], calibration.reference)
     found = replace(_found(other, drive.held, measured), pairs=pairs)
-    return HeldOutOutcome(found, (), other.used if own else None)
+    moved = about if isinstance(about, SmoothedTrajectory) and about.elsewhere else None
+    return HeldOutOutcome(found, (), other.used if own else None, moved)
 
 
 def _about_walls(

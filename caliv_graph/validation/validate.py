@@ -18,6 +18,7 @@ from caliv_graph.errors import ConfigError
 from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
+from caliv_graph.trajectory.about_poses import about_poses
 from caliv_graph.trajectory.select import VehicleTrajectory, noise_scales, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation.clouds import (
@@ -93,13 +94,14 @@ def validate(
             config, calibration = alone.config, alone.calibration
         extrinsics = _extrinsics(names, calibration, config)
         with progress.stage("smoothing the trajectory", None):
-            (rough,) = smooth_trajectories([recording], config, [[]], motions)
+            (rough,) = smooth_trajectories([recording], config, [[]], motions, by_walls=True)
         regions, no_target = target_regions(recording, rough, config, progress)
         held = measure_held_out(
             recording, rough, motions, calibration, extrinsics[AFTER], config, progress
         )
         if tracked is None:
-            way = _way(recording, rough, motions, calibration, extrinsics[AFTER], config, progress)
+            about = rough, held.about_walls
+            way = _way(recording, about, motions, calibration, extrinsics[AFTER], config, progress)
         else:
             way = way_of(recording.name, names, rough, held)
         trajectory = way.trajectory
@@ -136,20 +138,33 @@ def validate(
 
 def _way(
     recording: Recording,
-    rough: VehicleTrajectory,
+    smoothed: tuple[VehicleTrajectory, SmoothedTrajectory | None],
     motions: Mapping[int, MotionData],
     calibration: Calibration,
     extrinsics: Extrinsics,
     config: Config,
     progress: Progress,
 ) -> Way:
-    """The vehicle's poses at the scans to measure, by the motion data."""
+    """The vehicle's poses at the scans to measure, by the motion data.
+
+    `smoothed` are the rough trajectory and, if its heading drifts, where walls put the vehicle.
+
+    Raises:
+        TrajectoryError: the heading is uncertain, and no walls tell it.
+    """
+    rough, by_walls = smoothed
     names = extrinsics.T_vehicle_lidar
     chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
     nodes = _nodes(chosen, extrinsics, rough.span_ns)
     with progress.stage("smoothing the trajectory at the scans", None):
         scales = noise_scales([rough])
-        (trajectory,) = smooth_trajectories([recording], config, [nodes], motions, scales)
+        wanted = nodes if by_walls is None else np.union1d(nodes, by_walls.trajectory.stamps_ns)
+        (trajectory,) = smooth_trajectories(
+            [recording], config, [wanted], motions, scales, by_walls=by_walls is not None
+        )
+        if by_walls is not None and isinstance(trajectory, SmoothedTrajectory):
+            at = by_walls.trajectory.stamps_ns
+            trajectory = about_poses(trajectory, at, *by_walls.poses_at(at))
     return Way(
         trajectory,
         chosen,

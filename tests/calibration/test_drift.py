@@ -38,15 +38,24 @@ START = {"front": gtsam.Pose3()}
 
 @dataclass
 class Walls:
-    """`SlowErrors` that know where the vehicle is; and how often they were asked."""
+    """`SlowErrors` that know where the vehicle is; and how often they were asked.
 
+    `sigma_rad` is what they know of the heading.
+    """
+
+    sigma_rad: float = 1e-4
     asked: list[Sequence[VehicleTrajectory]] = field(default_factory=list)
 
     def __call__(self, *given: Any) -> tuple[tuple[tuple[Array, Array], ...], Any]:
         _, priors, _, trajectories, *_ = given
         self.asked.append(trajectories)
-        true = [COURSE.at(seconds(prior.stamps_ns)) for prior in priors]
-        return tuple((of.R_map_vehicle, of.p_map_vehicle) for of in true), FOUND
+        out = []
+        for prior in priors:
+            true = COURSE.at(seconds(prior.stamps_ns))
+            T = np.tile(np.eye(4), (len(prior.stamps_ns), 1, 1))
+            T[:, :3, :3], T[:, :3, 3] = true.R_map_vehicle, true.p_map_vehicle
+            out.append((T, np.full(len(T), self.sigma_rad)))
+        return tuple(out), FOUND
 
 
 def patches_of(*drives: int) -> tuple[DrivePatches, ...]:
@@ -111,13 +120,21 @@ def test_a_heading_that_nothing_tells_is_refused(drifting: SmoothedTrajectory) -
     _, config = speeds_alone()
     wide = replace(drifting, pose_sigmas=np.full(6, 0.3))
 
-    with pytest.raises(TrajectoryError, match=r"heading: its sigma is 17\.2 degrees, and walls"):
+    with pytest.raises(TrajectoryError, match=r"heading: its sigma is 17\.2 degrees, and the wal"):
         about_walls([wide], NO_STRUCTURE, START, {}, config)
 
     # Of a second drive, too, where only the first has walls.
     evidence = StructureEvidence(patches_of(0), errors=Walls())
-    with pytest.raises(TrajectoryError, match="walls in view of the LiDARs do not tell it"):
+    with pytest.raises(TrajectoryError, match="walls in view of the LiDARs tell it no better"):
         about_walls([drifting, wide], evidence, START, {}, config)
+
+    # Ground has patches, which tell no heading.
+    ground = StructureEvidence(patches_of(0), errors=Walls(sigma_rad=0.25))
+    with pytest.raises(TrajectoryError, match="drive where walls are in view all along"):
+        about_walls([wide], ground, START, {}, config)
+    (same,), told = about_walls([drifting], ground, START, {}, config)
+    assert same is drifting
+    assert told.T_vehicle_lidar is FOUND
 
     (same,), _ = about_walls([drifting], NO_STRUCTURE, START, {}, config)
     assert same is drifting

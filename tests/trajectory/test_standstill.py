@@ -10,6 +10,7 @@ import pytest
 from caliv_graph.products import MotionData
 from caliv_graph.trajectory.inputs import SmootherInput, check_input
 from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.solve import without_heading
 from caliv_graph.trajectory.standstill import TURN_RAD, standstills
 from tests.trajectory.motions import record, seconds
 from tests.trajectory.test_about_poses import BIAS_RAD_S, COURSE, SENSORS, WANTED, speeds_alone
@@ -82,3 +83,15 @@ def test_where_fixes_or_orientations_measure_the_heading_it_is_not_used() -> Non
     measured = with_zeros(record(COURSE, SENSORS, 3))
     assert not standstills(input_of(measured))
     assert not standstills(input_of(replace(measured, gnss=None)))
+
+
+def test_who_has_speeds_but_no_heading_is_told_to_stand_still() -> None:
+    data = input_of(speeds_alone()[0])
+
+    said = str(without_heading(data, 0.3))
+    assert "its sigma is 17.2 degrees. Record orientation in the IMU's messages, or GNSS" in said
+    assert "stand still for two seconds" in said
+    assert "walls" not in said
+
+    with_fixes = input_of(record(COURSE, SENSORS, 3))
+    assert str(without_heading(with_fixes, 0.3)).endswith("Record GNSS along the whole drive")

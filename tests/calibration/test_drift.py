@@ -10,11 +10,13 @@ import gtsam
 import numpy as np
 import pytest
 
+from caliv_graph.calibration import estimate
 from caliv_graph.calibration.drift import about_walls
 from caliv_graph.calibration.sensor_noise import usual_noise, with_noise
 from caliv_graph.calibration.structure_evidence import NO_STRUCTURE, StructureEvidence
 from caliv_graph.calibration.vehicle_parameters import motion_term
-from caliv_graph.errors import TrajectoryError
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.errors import SolveError, TrajectoryError
 from caliv_graph.products import Array
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.trajectory.about_poses import about_poses
@@ -175,3 +177,24 @@ def test_the_graph_has_the_pull_back_of_a_drive_without_uncertain_parameters() -
     turned = log_so3(np.swapaxes(true.R_map_vehicle[::5], 1, 2) @ R)
     assert np.abs(turned[:, 2]).max() > 0.03
     assert np.abs(step[:, 2] - turned[:, 2]).max() < 0.1 * np.abs(turned[:, 2]).max()
+
+
+def test_without_a_target_structure_is_solved_where_walls_put_the_vehicle(
+    drifting: SmoothedTrajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, config = speeds_alone()
+    solved: list[tuple[Any, ...]] = []
+
+    def solve(*given: Any) -> None:
+        solved.append(given)
+        raise SolveError("far enough")
+
+    monkeypatch.setattr(estimate, "solve_structure_and_ground", solve)
+    evidence = StructureEvidence(patches_of(0), errors=Walls())
+
+    with pytest.raises(SolveError, match="far enough"):
+        estimate.estimate_with_noise([], [drifting], config, SilentProgress(), (), evidence)
+
+    (((trajectory,), *_, told, _),) = solved
+    assert trajectory.elsewhere
+    assert told.T_vehicle_lidar is FOUND

@@ -277,8 +277,7 @@ def with_noise(
     open_only = len(noise.opened) == len(noise.correlated)
     out: list[VehicleTrajectory] = []
     for t in trajectories:
-        again = noise.correlated and isinstance(t, SmoothedTrajectory) and not t.elsewhere
-        if again and isinstance(t, SmoothedTrajectory) and t.data is not None:
+        if noise.correlated and isinstance(t, SmoothedTrajectory) and not t.elsewhere:
             stamps = t.trajectory.stamps_ns
             known: dict[str, float] | None = {} if open_only and not t.data.scales else None
             t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated, known)

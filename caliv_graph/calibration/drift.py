@@ -32,8 +32,9 @@ put the vehicle: by then lengths err by 2e-4 of themselves, a velocity of 2 m/s 
 LEFT_RAD = 0.005
 """Turn of a pose from where the motion data were linearised at which they stay."""
 
-ROUNDS = 3
-"""Times at most that they are linearised anew: one makes 1 mrad of a heading 0.1 rad off."""
+ROUNDS = 8
+"""Times at most that they are linearised anew: one makes 1 mrad of a heading 0.1 rad off; with few
+walls it takes three or four."""
 
 
 def about_walls(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import gtsam
@@ -190,24 +190,31 @@ class StructureEvidence:
         """Where the structure of some smoothed drives puts the vehicle; and at which stamps.
 
         `start` and `held` as for `slow_errors`. Of each drive T_map_vehicle (m, 4, 4) and 1 sigma
-        (m,) of the headings, rad.
+        (m,) of the headings, rad. Of some scans, or of all where these are too few: a bent map has
+        few places that several scans see alike.
 
         Raises:
             SolveError: it could not be solved.
         """
         heave_m = config.noise.heave_m or HEAVE_SIGMA_M
-        asked, stamps_ns = [], {}
-        for patches in self.patches if drives else ():
-            trajectory = trajectories[patches.drive]
-            if patches.drive not in drives or not isinstance(trajectory, SmoothedTrajectory):
-                continue
-            used = scans_for_errors(patches, int(patches.stamps_ns.max(initial=0)))
-            if not len(used.scan):
-                continue
-            stamps_ns[patches.drive] = stamps = np.unique(used.stamps_ns)
-            prior = plain_prior(trajectory.joint(stamps), stamps, heave_m)
-            asked.append(_Asked(used, prior, poses_found, trajectory))
-        told = self._told(asked, start, held, config)
+        told, stamps_ns = NOTHING_TOLD, dict[int, IntArray]()
+        for every in (False, True):
+            asked = []
+            for patches in self.patches if drives else ():
+                trajectory, drive = trajectories[patches.drive], patches.drive
+                if drive not in drives or drive in told.of_drives:
+                    continue
+                used = patches
+                if not every:
+                    used = scans_for_errors(patches, int(patches.stamps_ns.max(initial=0)))
+                if not len(used.scan) or not isinstance(trajectory, SmoothedTrajectory):
+                    continue
+                stamps_ns[drive] = stamps = np.unique(used.stamps_ns)
+                prior = plain_prior(trajectory.joint(stamps), stamps, heave_m)
+                asked.append(_Asked(used, prior, poses_found, trajectory))
+            found = self._told(asked, told.T_vehicle_lidar or start, held, config)
+            if found.T_vehicle_lidar is not None:
+                told = replace(found, of_drives={**told.of_drives, **found.of_drives})
         return told, {drive: stamps_ns[drive] for drive in told.of_drives}
 
     def pose_errors(

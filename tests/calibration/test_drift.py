@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.calibration import estimate
+from caliv_graph.calibration import estimate, structure_evidence
 from caliv_graph.calibration.drift import about_walls
 from caliv_graph.calibration.sensor_noise import usual_noise, with_noise
 from caliv_graph.calibration.structure_evidence import NO_STRUCTURE, StructureEvidence
@@ -42,17 +42,21 @@ START = {"front": gtsam.Pose3()}
 class Walls:
     """`SlowErrors` that know where the vehicle is; and how often they were asked.
 
-    `sigma_rad` is what they know of the heading.
+    `sigma_rad` is what they know of the heading, `least` the number of poses that they need.
     """
 
     sigma_rad: float = 1e-4
+    least: int = 0
     asked: list[Sequence[VehicleTrajectory]] = field(default_factory=list)
 
-    def __call__(self, *given: Any) -> tuple[tuple[tuple[Array, Array], ...], Any]:
+    def __call__(self, *given: Any) -> tuple[tuple[tuple[Array, Array] | None, ...], Any]:
         _, priors, _, trajectories, *_ = given
         self.asked.append(trajectories)
-        out = []
+        out: list[tuple[Array, Array] | None] = []
         for prior in priors:
+            if len(prior.stamps_ns) < self.least:
+                out.append(None)
+                continue
             true = COURSE.at(seconds(prior.stamps_ns))
             T = np.tile(np.eye(4), (len(prior.stamps_ns), 1, 1))
             T[:, :3, :3], T[:, :3, 3] = true.R_map_vehicle, true.p_map_vehicle
@@ -102,6 +106,25 @@ def test_walls_tell_the_bias_of_a_drive_whose_heading_drifts(drifting: SmoothedT
     assert walls.asked[0][0] is drifting
     assert told.T_vehicle_lidar is FOUND
     assert not told.of_drives
+
+
+def test_where_some_scans_tell_nothing_all_are_asked(
+    drifting: SmoothedTrajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thin chair and few walls: without, S2V yaw was 20 mrad off at 1.6, with exit code 0."""
+    _, config = speeds_alone()
+    (patches,) = patches_of(0)
+    few = replace(patches, stamps_ns=patches.stamps_ns[:5]).part(patches.scan < 5)
+    monkeypatch.setattr(structure_evidence, "scans_for_errors", lambda *_: few)
+    walls = Walls(least=20)
+
+    (found,), _ = about_walls(
+        [drifting], StructureEvidence((patches,), errors=walls), START, {}, config
+    )
+
+    assert isinstance(found, SmoothedTrajectory)
+    assert np.median(found.states.gyro_bias[:, 2]) == pytest.approx(BIAS_RAD_S, abs=5e-4)
+    assert len(walls.asked) == 4  # some, all; and again
 
 
 def test_a_known_heading_asks_no_walls(drifting: SmoothedTrajectory) -> None:

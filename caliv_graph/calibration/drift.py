@@ -79,10 +79,9 @@ def about_walls(
                 left.add(drive)
     for drive in sorted(untold | left):
         trajectory = now[drive]
-        if isinstance(trajectory, SmoothedTrajectory):
-            sigma_rad = float(trajectory.pose_sigmas[2])
-            if sigma_rad > LONE_YAW_SIGMA_RAD:
-                raise without_heading(trajectory.data, sigma_rad, walls=_drifts(trajectory))
+        if isinstance(trajectory, SmoothedTrajectory) and trajectory.heading_is_wide:
+            sigma_rad = trajectory.heading_sigma_rad
+            raise without_heading(trajectory.data, sigma_rad, walls=_drifts(trajectory))
     return tuple(now), replace(told, of_drives={})
 
 
@@ -91,7 +90,7 @@ def _drifts(trajectory: VehicleTrajectory) -> bool:
     return (
         isinstance(trajectory, SmoothedTrajectory)
         and not (trajectory.correlated or trajectory.open_kinds)
-        and bool(trajectory.pose_sigmas[2] > DRIFT_SIGMA_RAD)
+        and trajectory.heading_sigma_rad > DRIFT_SIGMA_RAD
     )
 
 

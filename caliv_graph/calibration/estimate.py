@@ -121,12 +121,10 @@ def estimate_with_noise(
     if not used and structure.patches:
         with threadpool_limits(limits=1):
             with progress.stage("estimating the noise of the sensors", None):
-                start: Mapping[str, gtsam.Pose3]
-                start = {name: lidar.guess() for name, lidar in config.lidars.items()}
-                before = tuple(trajectories)
-                trajectories, walls = about_walls(before, structure, start, {}, config)
-                grounds = with_rates_of(grounds, before, trajectories)
-                start = walls.T_vehicle_lidar or start
+                guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
+                drives = trajectories, grounds, structure
+                trajectories, grounds, walls = _about_walls(drives, guesses, {}, config)
+                start = walls.T_vehicle_lidar or guesses
                 told = structure.slow_errors(trajectories, start, {}, config)
                 noise = noise_of_motion(trajectories, config.noise, told.of_drives)
                 start = told.T_vehicle_lidar or start
@@ -165,11 +163,10 @@ def _estimate(
         rough = rough_solve(problem, observations, guessed, config, progress, limit)
     with progress.stage("estimating the noise of the sensors", None):
         extrinsics = problem.extrinsics(rough.state.values)
-        start: Mapping[str, gtsam.Pose3] = rough_extrinsics(rough.state)
-        before = tuple(trajectories)
-        trajectories, walls = about_walls(before, structure, start, extrinsics, config)
-        grounds = with_rates_of(grounds, before, trajectories)
-        start = walls.T_vehicle_lidar or start
+        before, placed = trajectories, rough_extrinsics(rough.state)
+        drives = trajectories, grounds, structure
+        trajectories, grounds, walls = _about_walls(drives, placed, extrinsics, config)
+        start = walls.T_vehicle_lidar or placed
         told = structure.slow_errors(trajectories, start, extrinsics, config)
         told = told if told.T_vehicle_lidar else walls
         noise = estimated_noise(rough.state, rough.registrations, before, told.of_drives)
@@ -367,6 +364,18 @@ def _solved(
     times["refinement"] = times.get("refinement", 0.0) + spent
     times["graph"] += solve.graph_seconds
     return _Solved(solution, solve, offsets_s, tuple(alike))
+
+
+def _about_walls(
+    drives: tuple[Sequence[VehicleTrajectory], Sequence[GroundObservation], StructureEvidence],
+    start: Mapping[str, gtsam.Pose3],
+    held: Mapping[str, gtsam.Pose3],
+    config: Config,
+) -> tuple[tuple[VehicleTrajectory, ...], tuple[GroundObservation, ...], ToldErrors]:
+    """`about_walls` of trajectories, and the ground by their rates; where the strips lie."""
+    trajectories, grounds, structure = drives
+    after, walls = about_walls(trajectories, structure, start, held, config)
+    return after, with_rates_of(grounds, trajectories, after), walls
 
 
 def _with_noise(

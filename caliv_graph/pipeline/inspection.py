@@ -26,7 +26,6 @@ from caliv_graph.products import (
 )
 from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
-from caliv_graph.trajectory.solve import LONE_YAW_SIGMA_RAD
 from caliv_graph.wording.inspection import heading_left_sentence
 from caliv_graph.wording.mounting import placement_sentence
 
@@ -100,9 +99,6 @@ def _look(recording: Recording, config: Config, progress: Progress) -> Look:
 
 def _on_heading(name: str, trajectory: VehicleTrajectory) -> tuple[str, ...]:
     """A sentence on a heading that is refused where no walls tell it."""
-    if not isinstance(trajectory, SmoothedTrajectory):
+    if not isinstance(trajectory, SmoothedTrajectory) or not trajectory.heading_is_wide:
         return ()
-    sigma_rad = float(trajectory.pose_sigmas[2])
-    if sigma_rad <= LONE_YAW_SIGMA_RAD:
-        return ()
-    return (heading_left_sentence(name, math.degrees(sigma_rad)),)
+    return (heading_left_sentence(name, math.degrees(trajectory.heading_sigma_rad)),)

@@ -14,7 +14,7 @@ import numpy as np
 
 from caliv_graph.config.model import Config
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.elimination import factor_of, half_solved
+from caliv_graph.structure.elimination import covariance_of, factor_of, half_solved
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import with_hold
@@ -115,11 +115,8 @@ def poses_found(found: Solved, prior: PosePrior) -> tuple[Array, Array]:
     m = len(prior.stamps_ns)
     T = np.tile(np.eye(4), (m, 1, 1))
     T[:, :3, :3], T[:, :3, 3] = found.state.R_map_vehicle, found.state.t_map_vehicle
-    H, _ = with_hold(found.problem, found.state, found.system)
-    columns = np.zeros((len(H), m))
-    columns[6 * np.arange(m) + 2, np.arange(m)] = 1.0
-    half = half_solved(factor_of(H), columns)
-    return T, np.sqrt(np.einsum("km,km->m", half, half))
+    headings = 6 * np.arange(m) + 2
+    return T, np.sqrt(np.diag(covariance_of(found.factor, headings)))
 
 
 def told_of_poses(found: Solved, prior: PosePrior, chosen: IntArray) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ from caliv_graph.trajectory.noise import stated
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory, within_span
-from caliv_graph.trajectory.solve import LONE_YAW_SIGMA_RAD, without_heading
+from caliv_graph.trajectory.solve import without_heading
 
 TWIST_WINDOW_NS = 50_000_000
 """Half the time over which the vehicle's velocity is averaged: that of a sweep at 10 Hz."""
@@ -142,9 +142,8 @@ def smooth_trajectories(
         else:
             known = None if scales is None else scales[index]
             smoothed = smooth_trajectory(motion, config, stamps, scales=known)
-            sigma_rad = float(smoothed.pose_sigmas[2])
-            if sigma_rad > LONE_YAW_SIGMA_RAD and not by_walls:
-                raise without_heading(smoothed.data, sigma_rad)
+            if smoothed.heading_is_wide and not by_walls:
+                raise without_heading(smoothed.data, smoothed.heading_sigma_rad)
             out.append(smoothed)
     return tuple(out)
 

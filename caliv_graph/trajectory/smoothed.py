@@ -22,6 +22,7 @@ from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, log_so3
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
 from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
+from caliv_graph.trajectory.solve import LONE_YAW_SIGMA_RAD
 from caliv_graph.trajectory.states import States, poses_of_vehicle, without_bias
 
 PART_NS, PAUSE_NS = 60_000_000_000, 5_000_000_000
@@ -149,6 +150,16 @@ class SmoothedTrajectory:
     errors: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     elsewhere: bool = False
     chain_nodes: IntArray | None = field(default=None, repr=False)
+
+    @property
+    def heading_sigma_rad(self) -> float:
+        """1 sigma of the heading by the motion data, median over the nodes."""
+        return float(self.pose_sigmas[2])
+
+    @property
+    def heading_is_wide(self) -> bool:
+        """Whether it is too wide to be used, unless walls tell it."""
+        return self.heading_sigma_rad > LONE_YAW_SIGMA_RAD
 
     @property
     def span_ns(self) -> tuple[int, int]:

@@ -12,12 +12,10 @@ import numpy as np
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, TwistSamples
 from caliv_graph.trajectory.inputs import SmootherInput
-
-SPEED_M_S = 0.01
-"""Along each axis, below which a vehicle stands; odometry of wheels that stand reads zero."""
+from caliv_graph.trajectory.wheels import STANDING_M_S
 
 YAW_RATE_RAD_S = 0.005
-"""The same of a yaw rate, where an odometry has one: robots turn on the spot."""
+"""Yaw rate up to which a vehicle stands, where an odometry has one: robots turn on the spot."""
 
 LEAST_NS, EDGE_NS = 500_000_000, 150_000_000
 """Shortest standstill; and what is left out at both of its ends, where encoders still read zero or
@@ -83,7 +81,7 @@ def standstills(data: SmootherInput) -> tuple[Standstill, ...]:
 def _standing_ns(twist: TwistSamples) -> list[tuple[int, int]]:
     """Begin and end of each time at which the speeds are zero, without its edges."""
     with np.errstate(invalid="ignore"):
-        standing: BoolArray = np.asarray((np.abs(twist.velocity) <= SPEED_M_S).all(axis=1))
+        standing: BoolArray = np.asarray((np.abs(twist.velocity) <= STANDING_M_S).all(axis=1))
         if twist.yaw_rate is not None:
             standing &= ~(np.abs(twist.yaw_rate) > YAW_RATE_RAD_S)
     stamps, out = twist.stamps_ns, []

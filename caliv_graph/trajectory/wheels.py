@@ -71,7 +71,8 @@ ROUNDING = 1e-6
 filter in the plane leaves rounding where an odometry has zeros."""
 
 STANDING_M_S = 0.01
-"""Forward velocity up to which a vehicle stands, so that it does not move sideways either."""
+"""Velocity up to which a vehicle stands: forward, so that it does not move sideways either, and
+along every axis, so that it does not turn (`standstill.py`). Wheels that stand read zero."""
 
 UNMEASURED_M_S = 100.0
 """1 sigma of a velocity that nobody measured."""

@@ -31,6 +31,7 @@ from tests.trajectory.test_about_poses import (
     COURSE,
     SENSORS,
     WANTED,
+    smoothed_by_speeds,
     speeds_alone,
 )
 
@@ -84,10 +85,9 @@ def patches_of(*drives: int) -> tuple[DrivePatches, ...]:
     )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def drifting() -> SmoothedTrajectory:
-    motion, config = speeds_alone()
-    return smooth_trajectory(motion, config, WANTED)
+    return smoothed_by_speeds()
 
 
 def test_walls_tell_the_bias_of_a_drive_whose_heading_drifts(drifting: SmoothedTrajectory) -> None:

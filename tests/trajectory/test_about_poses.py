@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -42,10 +43,15 @@ def speeds_alone(sensors: Sensors = SENSORS) -> tuple[MotionData, Config]:
     return replace(motion, imu=imu, gnss=None), config_for(sensors)
 
 
-@pytest.fixture(scope="module")
-def smoothed() -> SmoothedTrajectory:
+@cache
+def smoothed_by_speeds() -> SmoothedTrajectory:
     motion, config = speeds_alone()
     return smooth_trajectory(motion, config, WANTED)
+
+
+@pytest.fixture
+def smoothed() -> SmoothedTrajectory:
+    return smoothed_by_speeds()
 
 
 def truth() -> tuple[Array, Array]:

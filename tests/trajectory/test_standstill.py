@@ -13,7 +13,14 @@ from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.solve import without_heading
 from caliv_graph.trajectory.standstill import TURN_RAD, standstills
 from tests.trajectory.motions import record, seconds
-from tests.trajectory.test_about_poses import BIAS_RAD_S, COURSE, SENSORS, WANTED, speeds_alone
+from tests.trajectory.test_about_poses import (
+    BIAS_RAD_S,
+    COURSE,
+    SENSORS,
+    WANTED,
+    smoothed_by_speeds,
+    speeds_alone,
+)
 
 STANDS_S = COURSE.drive.speed.standstill_s
 
@@ -42,7 +49,7 @@ def test_the_bias_is_what_the_gyroscope_reads_while_the_vehicle_stands() -> None
     assert np.abs(first.rate - [0.0, 0.0, BIAS_RAD_S]).max() < 4.0 * first.sigmas.max()
     # A turn of the body over what is left of a second, without its edges.
     assert first.sigmas.min() > TURN_RAD
-    wide = smooth_trajectory(motion, config, WANTED)
+    wide = smoothed_by_speeds()
     known = smooth_trajectory(with_zeros(motion), config, WANTED)
     assert known.pose_sigmas[2] < 0.25 * wide.pose_sigmas[2]
     bias = np.median(known.states.gyro_bias[:, 2])

@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 
 from caliv_graph.pipeline import inspection
-from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation import held_out
 from caliv_graph.validation.clouds import Extrinsics
 from tests.calibration.test_drift import START, Walls, patches_of
-from tests.trajectory.test_about_poses import WANTED, speeds_alone
+from tests.trajectory.test_about_poses import smoothed_by_speeds, speeds_alone
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def drifting() -> SmoothedTrajectory:
-    motion, config = speeds_alone()
-    return smooth_trajectory(motion, config, WANTED)
+    return smoothed_by_speeds()
 
 
 def test_a_drifting_drive_is_validated_where_walls_put_it(

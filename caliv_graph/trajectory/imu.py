@@ -276,8 +276,18 @@ class DeadReckoning:
         return found
 
     def _worked_out(self, stamps_ns: IntArray) -> tuple[Array, Array, Array]:
+        # Nodes are asked for once per measurement near them.
+        starts = np.flatnonzero(np.diff(stamps_ns)) + 1
+        if 2 * (len(starts) + 1) < len(stamps_ns):
+            starts = np.concatenate([[0], starts])
+            each = np.diff(starts, append=len(stamps_ns))
+            R, v, p = (np.repeat(of, each, axis=0) for of in self._worked_out(stamps_ns[starts]))
+            return R, v, p
         R, v, p = self._cumulative
-        k = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, "right") - 1, 0, len(R) - 2)
+        k = np.searchsorted(self.stamps_ns, stamps_ns, "right") - 1
+        if np.array_equal(self.stamps_ns[k], stamps_ns):  # as of what came with the samples
+            return R[k], v[k], p[k]
+        k = np.clip(k, 0, len(R) - 2)
         # Beyond the ends the line through the first or last two readings is extended.
         tau: Array = np.asarray(stamps_ns - self.stamps_ns[k], dtype=np.float64) * 1e-9
         dR, dv, dp = self._step(k, tau)

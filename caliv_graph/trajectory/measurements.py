@@ -89,14 +89,16 @@ def rotated(R: Array, cov: Array) -> Array:
 
 def _weighted_mean(group: IntArray, values: Array, cov: Array) -> tuple[IntArray, Array, Array]:
     """Groups (g,); means (g, 3, c) of (m, 3, c) vectors, weighted by `cov` (m, 3, 3); their cov."""
-    groups, at = np.unique(group, return_inverse=True)
+    if (np.diff(group) < 0).any():
+        order = np.argsort(group, kind="stable")
+        group, values, cov = group[order], values[order], cov[order]
+    starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
+    groups = group[starts]
     weight = np.linalg.inv(cov)
-    information = np.zeros((len(groups), 3, 3))
-    np.add.at(information, at, weight)
-    moment = np.zeros((len(groups), *values.shape[1:]))
-    np.add.at(moment, at, np.einsum("nij,njc->nic", weight, values))
+    information = np.add.reduceat(weight, starts)
+    moment = np.add.reduceat(weight @ values, starts)
     mean_cov = np.linalg.inv(information)
-    return np.asarray(groups), np.einsum("nij,njc->nic", mean_cov, moment), np.asarray(mean_cov)
+    return np.asarray(groups), np.asarray(mean_cov @ moment), np.asarray(mean_cov)
 
 
 def orientations_at_nodes(

@@ -280,7 +280,8 @@ def with_noise(
         if noise.correlated and isinstance(t, SmoothedTrajectory) and not t.elsewhere:
             stamps = t.trajectory.stamps_ns
             known: dict[str, float] | None = {} if open_only and not t.data.scales else None
-            t = smooth_trajectory(t.data.motion, t.data.config, stamps, noise.correlated, known)
+            motion, config = t.data.motion, t.data.config
+            t = smooth_trajectory(motion, config, stamps, noise.correlated, known, t)
         out.append(t)
     return out
 

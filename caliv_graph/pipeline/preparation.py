@@ -51,7 +51,6 @@ from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import (
     VehicleTrajectory,
     are_given,
-    noise_scales,
     smooth_trajectories,
     takes_given_poses,
 )
@@ -172,11 +171,10 @@ def prepare(
         raise no_target
     with progress.stage("smoothing the trajectory at the scans", None):
         stamps = _stamps_seen(len(recordings), observations, patches)
-        scales = noise_scales(rough)
-        del rough  # a graph of its own, which nobody asks any more
         trajectories = smooth_trajectories(
-            recordings, config, stamps, motions, scales, by_walls=True
+            recordings, config, stamps, motions, rough, by_walls=True
         )
+    del rough  # a graph of its own, which nobody asks any more
     grounds: Sequence[GroundObservation] = ()
     ground_warnings: Sequence[str] = ()
     others = {patch.lidars[i] for patch in patches for i in np.unique(patch.scan_lidar)}

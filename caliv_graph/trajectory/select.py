@@ -118,16 +118,18 @@ def smooth_trajectories(
     config: Config,
     wanted: Sequence[Sequence[int] | IntArray] | None = None,
     motions: Mapping[int, MotionData] | None = None,
-    scales: Sequence[Mapping[str, float] | None] | None = None,
+    earlier: Sequence[VehicleTrajectory] | None = None,
     *,
     by_walls: bool = False,
 ) -> tuple[SmoothedTrajectory | GivenTrajectory, ...]:
     """The trajectory of each drive: given poses (`takes_given_poses`), or smoothed raw sensors.
 
     `wanted` are per drive the stamps at which poses are wanted; None: those of all clouds.
-    `motions` are motion data by the recording's index, if they have been read already. `scales` are
-    the noise levels of an earlier smoothing (`noise_scales`); None: estimated. `by_walls`: a wide
-    heading is not refused, for walls are to tell it (`calibration.drift`).
+    `motions` are motion data by the recording's index, if they have been read already. `earlier`
+    are trajectories of the same drives by an earlier smoothing: the search begins there, with their
+    noise levels, which are told best where nodes are even. Later nodes crowd where scans see a
+    target. `by_walls`: a wide heading is not refused, for walls are to tell it
+    (`calibration.drift`).
 
     Raises:
         TrajectoryError: the data of a drive do not determine its motion.
@@ -140,22 +142,16 @@ def smooth_trajectories(
         if takes_given_poses(motion, config):
             out.append(_given(motion, stamps))
         else:
-            known = None if scales is None else scales[index]
-            smoothed = smooth_trajectory(motion, config, stamps, scales=known)
+            begin = None if earlier is None else earlier[index]
+            if isinstance(begin, SmoothedTrajectory):
+                known = begin.data.scales
+                smoothed = smooth_trajectory(motion, config, stamps, (), known, begin)
+            else:
+                smoothed = smooth_trajectory(motion, config, stamps)
             if smoothed.heading_is_wide and not by_walls:
                 raise without_heading(smoothed.data, smoothed.heading_sigma_rad)
             out.append(smoothed)
     return tuple(out)
-
-
-def noise_scales(
-    trajectories: Sequence[VehicleTrajectory],
-) -> tuple[Mapping[str, float] | None, ...]:
-    """Per drive the scales on the stated sigmas, to smooth it again; None for given poses.
-
-    They are told best where nodes are even: later ones crowd where scans see a target.
-    """
-    return tuple(t.data.scales if isinstance(t, SmoothedTrajectory) else None for t in trajectories)
 
 
 def takes_given_poses(motion: MotionData, config: Config) -> bool:

@@ -44,6 +44,7 @@ from caliv_graph.trajectory.states import States, poses_of_vehicle
 from caliv_graph.trajectory.uncertain import (
     Settled,
     are_wide,
+    moved,
     settle,
     uncertain_parameters,
     with_late_clock,
@@ -60,6 +61,7 @@ def smooth_trajectory(
     stamps_ns: Sequence[int] | IntArray,
     correlated: Sequence[CorrelatedError] = (),
     scales: Mapping[str, float] | None = None,
+    earlier: SmoothedTrajectory | None = None,
 ) -> SmoothedTrajectory:
     """Smooths one drive: IMU, and GNSS, velocities or both; orientations within the IMU's messages.
 
@@ -68,7 +70,8 @@ def smooth_trajectory(
     Poses are wanted at `stamps_ns` (of LiDAR scans), in any order; those outside the span of the
     IMU are in `lost_ns` of the result. `correlated` are errors of sensors that the config does not
     give. `scales` on the stated sigmas are those of an earlier smoothing of the drive
-    (`SmootherInput.scales`); None: estimated.
+    (`SmootherInput.scales`); None: estimated. `earlier` is an earlier smoothing of the drive, where
+    the search begins; None: at the measurements.
 
     Raises:
         TrajectoryError: what was recorded does not determine the motion; says what is missing.
@@ -77,7 +80,7 @@ def smooth_trajectory(
     data = scaled(data, scales or {})
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)
-    data, states, parameters = _begun(data, nodes)
+    data, states, parameters = _begun_at(earlier, data, nodes) or _begun(data, nodes)
     errors = errors_in(data, [*configured_errors(config), *correlated])
     robust, estimate = solve_without_outliers(data, nodes, states)
     warnings += [*lines, *robust.warnings]
@@ -154,6 +157,21 @@ def _begun(
     if are_wide(parameters):
         return _roughly_settled(data, nodes, states, parameters)
     return data, states, parameters
+
+
+def _begun_at(
+    earlier: SmoothedTrajectory | None, data: SmootherInput, nodes: IntArray
+) -> tuple[SmootherInput, States, tuple[UncertainParameter, ...]] | None:
+    """`_begun` where an earlier smoothing has ended; None: there is none with these parameters."""
+    if earlier is None or (data.wheels is None and needs_guess(data)):
+        return None  # a guess goes with the nodes
+    fresh, found = uncertain_parameters(data), earlier.parameters
+    if [p.parameter.name for p in fresh] != [p.parameter.name for p in found]:
+        return None
+    offsets = [np.asarray(p.offset) for p in found]
+    if offsets:
+        data, _ = moved(data, fresh, np.concatenate(offsets))
+    return data, earlier.states_at(nodes), found
 
 
 def _first_states(data: SmootherInput, nodes: IntArray) -> States:

@@ -18,7 +18,13 @@ from caliv_graph.readers.common_stamps import MERGE_NS
 from caliv_graph.trajectory.build import KINDS, Estimate, build_graph, to_values
 from caliv_graph.trajectory.chain import POSE, Chain, inverse_of
 from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
-from caliv_graph.trajectory.imu import DeadReckoning, Inertial, exp_so3, log_so3
+from caliv_graph.trajectory.imu import (
+    DeadReckoning,
+    Inertial,
+    exp_so3,
+    interpolate,
+    log_so3,
+)
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
 from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
@@ -226,6 +232,19 @@ class SmoothedTrajectory:
         R, p, _ = self._imu_states(within_span(stamps_ns, self.span_ns, "its span"))
         R_iv, t_iv = stack([self.T_vehicle_imu.inverse()])
         return R @ R_iv[0], p + R @ t_iv[0]
+
+    def states_at(self, stamps_ns: IntArray) -> States:
+        """The estimate at any times (m,) within the span: where another smoothing begins.
+
+        Raises:
+            TrajectoryError: a stamp is outside the span.
+        """
+        R, p, v = self._imu_states(within_span(stamps_ns, self.span_ns, "its span"))
+        biases = (
+            interpolate(stamps_ns, self.nodes_ns, bias)
+            for bias in (self.states.force_bias, self.states.gyro_bias)
+        )
+        return States(R, p, v, *biases, self.states.yaw_bias_rad)
 
     def _imu_states(self, stamps: IntArray) -> tuple[Array, Array, Array]:
         """R_map_imu, its origin and its velocity in the map."""

@@ -19,7 +19,7 @@ from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
 from caliv_graph.trajectory.about_poses import about_poses
-from caliv_graph.trajectory.select import VehicleTrajectory, noise_scales, smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation.clouds import (
     Clouds,
@@ -157,10 +157,9 @@ def _way(
     chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
     nodes = _nodes(chosen, extrinsics, rough.span_ns)
     with progress.stage("smoothing the trajectory at the scans", None):
-        scales = noise_scales([rough])
         wanted = nodes if by_walls is None else np.union1d(nodes, by_walls.trajectory.stamps_ns)
         (trajectory,) = smooth_trajectories(
-            [recording], config, [wanted], motions, scales, by_walls=by_walls is not None
+            [recording], config, [wanted], motions, [rough], by_walls=by_walls is not None
         )
         if by_walls is not None and isinstance(trajectory, SmoothedTrajectory):
             at = by_walls.trajectory.stamps_ns

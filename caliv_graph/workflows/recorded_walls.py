@@ -23,7 +23,7 @@ from caliv_graph.structure.own_body import without_own_body
 from caliv_graph.structure.read import level, read_patches
 from caliv_graph.structure.solve import solve_structure
 from caliv_graph.structure.term import aligned_start, problem_of, usable
-from caliv_graph.trajectory.select import VehicleTrajectory, noise_scales, smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,7 @@ def solved_walls(
         return None
     with progress.stage("joining the walls", None):
         stamps, motions = np.unique(patches.stamps_ns), {0: recording.motion()}
-        scales = noise_scales([rough])
-        (trajectory,) = smooth_trajectories([recording], config, [stamps], motions, scales)
+        (trajectory,) = smooth_trajectories([recording], config, [stamps], motions, [rough])
         heave_m = usual_noise(config.noise).heave_m
         noise = first_pose_noise(config.noise)
         priors = pose_priors([trajectory], {0: stamps}, heave_m, noise, config)

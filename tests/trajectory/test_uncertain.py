@@ -14,6 +14,7 @@ from caliv_graph.conventions import key_imu, key_parameters
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, MotionData
+from caliv_graph.trajectory import smooth
 from caliv_graph.trajectory.columns import columns_of
 from caliv_graph.trajectory.inputs import check_input
 from caliv_graph.trajectory.mounting import COURSE_SIGMA_RAD, with_guessed_rotation
@@ -296,3 +297,53 @@ def test_fixes_whose_clock_is_far_off_lead_to_the_right_trajectory(late_s: float
     assert len(smoothed.gnss_rejected) == 0
     assert not [w for w in smoothed.warnings if "noise.gnss" in w]
     assert nees(late, smoothed) < 16.0
+
+
+@pytest.mark.parametrize("unknown", ["arm", "clock"])
+def test_a_smoothing_that_begins_where_another_has_ended_ends_in_the_same_place(
+    unknown: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With other nodes, and at the same ones; also of a clock that the motion data free."""
+    changes: dict[str, dict[str, dict[str, object]]] = {
+        "arm": {"gnss": {"lever_arm": None}},
+        "clock": {"gnss": {"lever_arm": list(SENSORS.lever_arm), "time_offset_sigma_s": 0.02}},
+    }
+    motion = record(COURSE, SENSORS, 3)
+    assert motion.gnss is not None
+    if unknown == "clock":
+        late_ns = motion.gnss.stamps_ns + 80_000_000
+        motion = replace(motion, gnss=replace(motion.gnss, stamps_ns=late_ns))
+    config = config_for(SENSORS, **changes[unknown])
+    first = smooth_trajectory(motion, config, [])
+    scales = first.data.scales
+    plain = smooth_trajectory(motion, config, WANTED, (), scales)
+
+    monkeypatch.setattr(smooth, "_begun", None)  # nothing is searched for from the measurements
+    for earlier in (first, plain):
+        found = smooth_trajectory(motion, config, WANTED, (), scales, earlier)
+        assert np.array_equal(found.gnss_rejected, plain.gnss_rejected)
+        assert found.warnings == plain.warnings
+        offsets = [
+            np.concatenate([np.asarray(p.offset) for p in t.parameters]) for t in (found, plain)
+        ]
+        sigmas = np.sqrt(np.diag(plain.parameter_cov))
+        assert np.abs((offsets[0] - offsets[1]) / sigmas).max() < 0.02
+        cov = plain.trajectory.cov
+        assert cov is not None
+        for T, other, C in zip(
+            found.trajectory.T_map_vehicle, plain.trajectory.T_map_vehicle, cov, strict=True
+        ):
+            away = gtsam.Pose3.Logmap(other.between(T))
+            assert np.abs(away / np.sqrt(np.diag(C))).max() < 0.02
+
+
+def test_a_smoothing_with_other_parameters_begins_at_the_measurements() -> None:
+    motion = record(COURSE, SENSORS, 3)
+    first = smooth_trajectory(motion, config_for(SENSORS, gnss=ARM), [])
+    other = config_for(SENSORS, gnss=ARM, imu={"gyroscope_scale_sigma": 0.001})
+    assert len(first.parameters) < len(smooth_trajectory(motion, other, []).parameters)
+
+    plain = smooth_trajectory(motion, other, WANTED)
+    found = smooth_trajectory(motion, other, WANTED, earlier=first)
+
+    np.testing.assert_array_equal(found.states.p_map_imu, plain.states.p_map_imu)

@@ -23,7 +23,6 @@ from caliv_graph.trajectory.effects import (
     smoothed_in_time,
 )
 from caliv_graph.trajectory.noise import configured_errors
-from caliv_graph.trajectory.select import noise_scales
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.variances import NoiseLikelihood, fit, free_components
@@ -133,9 +132,7 @@ def test_a_drive_that_is_smoothed_again_keeps_its_noise_levels(
     motion = recorded(gnss_vertical=2.0)
     first = smoothed(motion)
     monkeypatch.setattr("caliv_graph.trajectory.smooth.estimated_scales", None)
-    again = smooth_trajectory(
-        motion, config_for(Sensors()), WANTED, scales=noise_scales([first])[0]
-    )
+    again = smooth_trajectory(motion, config_for(Sensors()), WANTED, scales=first.data.scales)
     assert again.data.scales == first.data.scales
     assert again.noise_sources == first.noise_sources
     for one, other in zip(

@@ -22,7 +22,7 @@ from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.smooth import _solved_roughly, smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import covariances_of
-from caliv_graph.trajectory.uncertain import _eliminated, _with_variable
+from caliv_graph.trajectory.uncertain import _eliminated, _with_variable, steps_ahead
 from tests.trajectory.motions import (
     Course,
     Sensors,
@@ -335,6 +335,18 @@ def test_a_smoothing_that_begins_where_another_has_ended_ends_in_the_same_place(
         ):
             away = gtsam.Pose3.Logmap(other.between(T))
             assert np.abs(away / np.sqrt(np.diag(C))).max() < 0.02
+
+
+def test_steps_that_shrink_by_a_constant_factor_are_taken_at_once() -> None:
+    information = np.diag([100.0, 1.0])
+    before = np.array([0.1, 0.2])
+
+    # Halved each time: what follows a half adds up to one.
+    assert steps_ahead(before, 0.5 * before, information) == pytest.approx(2.0)
+    # Across it, back, and hardly any shorter.
+    assert steps_ahead(before, np.array([-0.002, 0.1]), information) == 1.0
+    assert steps_ahead(before, -0.5 * before, information) == 1.0
+    assert steps_ahead(before, 0.9 * before, information) == 1.0
 
 
 def test_a_smoothing_with_other_parameters_begins_at_the_measurements() -> None:

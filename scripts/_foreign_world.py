@@ -172,7 +172,49 @@ def bicycle() -> Mesh:
     return m
 
 
-TARGETS = {"chair": chair, "boxes": boxes, "bin": bin_, "bicycle": bicycle}
+def ladder() -> Mesh:
+    """A step ladder, open: rails of 5 x 2.5 cm and flat steps."""
+    m = Mesh()
+    for lean, steps in ((0.28, 5), (-0.28, 2)):
+        foot = 1.5 * np.sin(lean)
+        for y in (-0.22, 0.22):
+            m.box((-foot / 2, y, 0.75), (0.05, 0.025, 1.55), (0, lean, 0))
+        for k in range(1, steps + 1):
+            z = 1.45 * k / (steps + 0.5)
+            m.box((-foot * (1 - z / 1.5), 0, z), (0.08, 0.44, 0.025))
+    m.box((0, 0, 1.52), (0.2, 0.5, 0.03))
+    return m
+
+
+def cones() -> Mesh:
+    """Three traffic cones close to each other."""
+    m = Mesh()
+    for x, y, high in ((0.0, 0.0, 0.75), (0.45, 0.1, 0.5), (0.1, 0.5, 0.75)):
+        m.box((x, y, 0.02), (0.36, 0.36, 0.04))
+        m.tube(np.array([x, y, 0.04]), np.array([x, y, high]), 0.14, 0.025, 16)
+    return m
+
+
+def sign() -> Mesh:
+    """A road sign on a post in a foot of two parts."""
+    m = Mesh()
+    m.box((0, 0, 0.05), (0.8, 0.3, 0.1))
+    m.box((0.1, 0, 0.14), (0.3, 0.4, 0.09), (0, 0, 0.4))
+    m.tube(np.array([0, 0, 0.1]), np.array([0.02, 0, 1.9]), 0.03, 0.03, 8)
+    m.box((0.05, 0, 1.45), (0.01, 0.6, 0.6), (0.5, 0, 0))
+    m.box((0.05, 0, 0.95), (0.01, 0.5, 0.25))
+    return m
+
+
+TARGETS = {
+    "chair": chair,
+    "boxes": boxes,
+    "bin": bin_,
+    "bicycle": bicycle,
+    "ladder": ladder,
+    "cones": cones,
+    "sign": sign,
+}
 
 
 def person() -> Mesh:

@@ -2,11 +2,13 @@
 
     .venv/bin/python scripts/benchmark_foreign.py --scenarios eight robot --seeds 1
     .venv/bin/python scripts/benchmark_foreign.py --scenarios slalom --off edges,channel_angle
+    .venv/bin/python scripts/benchmark_foreign.py --scenarios random --first 1 --seeds 20
 
 The simulator (`_foreign_*.py`) imports nothing from caliv_graph. It writes a bag, a config as a
 user would, with errors of lever arms and guesses, and the truth; the bag is calibrated as
 `caliv-graph calibrate` does. Errors are in vehicle axes, of the axes that the drive determines,
-with their sigmas. Bags stay in the folder (about half a GB for two LiDARs) only with --keep.
+with their sigmas. The scenario `random` draws course, vehicle, LiDARs, place and sensors from the
+seed (`_foreign_random.py`); it is not among the scenarios that run by default. Bags stay in the folder (about half a GB for two LiDARs) only with --keep.
 """
 
 from __future__ import annotations
@@ -36,9 +38,13 @@ from caliv_graph.results.truth_file import read_truth
 from scripts._command import exit_code_of, positive
 from scripts._foreign_draws import EFFECTS, Draws
 from scripts._foreign_drives import SCENARIOS, simulate
+from scripts._foreign_random import in_words, random_scenario
 from scripts._judged import nees_text, outcome_of, worst
 
 OUT = REPOSITORY / "out" / "foreign"
+
+RANDOM = "random"
+"""The scenario that is drawn from the seed."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,7 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS), metavar="NAME"
+        "--scenarios",
+        nargs="+",
+        choices=[*SCENARIOS, RANDOM],
+        default=list(SCENARIOS),
+        metavar="NAME",
     )
     parser.add_argument("--seeds", type=positive, default=1, help="how many (default: 1)")
     parser.add_argument("--first", type=positive, default=1, help="the first seed (default: 1)")
@@ -78,8 +88,12 @@ def text_of(draws: Draws, folder: Path, keep: bool) -> str:
     """Simulates, calibrates and compares once; what to print."""
     if folder.exists():
         shutil.rmtree(folder)
-    simulate(SCENARIOS[draws.scenario], draws, folder)
+    drawn = draws.scenario == RANDOM
+    scenario = random_scenario(draws.seed) if drawn else SCENARIOS[draws.scenario]
+    simulate(scenario, draws, folder)
     title = f"{draws.scenario}, seed {draws.seed}"
+    if drawn:
+        title += f" ({in_words(scenario)})"
     if draws.off:
         title += f", without {', '.join(sorted(draws.off))}"
     begun = time.monotonic()

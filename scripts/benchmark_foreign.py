@@ -8,7 +8,8 @@ The simulator (`_foreign_*.py`) imports nothing from caliv_graph. It writes a ba
 user would, with errors of lever arms and guesses, and the truth; the bag is calibrated as
 `caliv-graph calibrate` does. Errors are in vehicle axes, of the axes that the drive determines,
 with their sigmas. The scenario `random` draws course, vehicle, LiDARs, place and sensors from the
-seed (`_foreign_random.py`); it is not among the scenarios that run by default. Bags stay in the folder (about half a GB for two LiDARs) only with --keep.
+seed (`_foreign_random.py`); it is not among those that run by default. Bags stay in the folder
+(about half a GB for two LiDARs) only with --keep.
 """
 
 from __future__ import annotations

@@ -55,6 +55,7 @@ class TrajectoryGraph:
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     kinds: list[str] = field(default_factory=list)
+    fixes: list[int] = field(default_factory=list)
 
     def add(self, kind: str, factor: gtsam.NonlinearFactor) -> None:
         """Appends a factor."""
@@ -67,6 +68,7 @@ class TrajectoryGraph:
         for number, kind in enumerate(self.kinds):
             if kind in kinds:
                 out.add(kind, self.factors.at(number))
+        out.fixes += self.fixes if "gnss" in kinds else []
         return out
 
 
@@ -187,6 +189,7 @@ def _add_positions(
             key_imu(i), key_velocity(i), measured, offset, delay_s, gravity, noise
         )
         graph.add("gnss", factor)
+        graph.fixes.append(int(positions.fixes[k]))
 
 
 def _add_orientations(

@@ -210,7 +210,8 @@ def white_sigmas(data: SmootherInput, kind: str) -> Array:
     """(3,) median 1 sigma of one fix (m) or orientation (rad), as it is in use, map axes."""
     if kind == "gnss":
         assert data.positions is not None
-        cov, scale = data.positions.cov_map, 1.0
+        # Rough fixes have errors in common anyway.
+        cov, scale = data.positions.cov_map[data.positions.shared == 1.0], 1.0
     else:
         imu = data.motion.imu
         assert imu is not None

@@ -14,6 +14,18 @@ from caliv_graph.products import Array, GnssFixes, IntArray
 from caliv_graph.trajectory.noise import gnss_covariances
 
 
+ROUGH_RATIO = 3.0
+"""Fixes that state this many times the sigma of the better ones are rough: the receiver has lost
+its fixed ambiguities, or sees reflections."""
+
+BETTER = 0.25
+"""Quantile of the stated sigmas that stands for the better fixes."""
+
+ROUGH_TIME_S = 10.0
+"""Correlation time of the errors of rough fixes: float ambiguities and reflections last for seconds
+to minutes."""
+
+
 @dataclass(frozen=True)
 class Positions:
     """Positions of the GNSS antenna.
@@ -21,7 +33,9 @@ class Positions:
     Attributes:
         stamps_ns: (n,) strictly increasing.
         position_map: (n, 3) metres, ENU about the first fix.
-        cov_map: (n, 3, 3) m^2.
+        cov_map: (n, 3, 3) m^2, of errors that are taken to be independent.
+        shared: (n,) how many times as large `cov_map` is as the covariance of one fix, since rough
+            fixes have errors in common; 1 for the others.
         origin_deg_m: latitude, longitude (degrees) and altitude (m) of the map's origin.
         source: of the covariances: messages, config, or the paper's table.
     """
@@ -29,6 +43,7 @@ class Positions:
     stamps_ns: IntArray
     position_map: Array
     cov_map: Array
+    shared: Array
     origin_deg_m: tuple[float, float, float]
     source: str
 
@@ -57,7 +72,29 @@ def positions_in_map(
     origin = (float(latitude[0]), float(longitude[0]), float(altitude[0]))
     stamps = np.asarray(gnss.stamps_ns, dtype=np.int64)[usable]
     position_map = places_in_map(latitude, longitude, altitude, origin)
-    return Positions(stamps, position_map, cov[usable], origin, source), warnings
+    cov = cov[usable]
+    shared = shared_by_rough(stamps, cov)
+    cov = cov * shared[:, None, None]
+    return Positions(stamps, position_map, cov, shared, origin, source), warnings
+
+
+def shared_by_rough(stamps_ns: IntArray, cov_map: Array) -> Array:
+    """(n,) factors on stated covariances (n, 3, 3) of fixes for errors that rough ones share.
+
+    Within a run of m rough fixes, dt apart, errors of correlation time T leave as much to their
+    mean as independent ones of 2 T / dt times the variance do, and m times is all that can be. Fixes
+    are rough by their horizontal sigma.
+    """
+    out = np.ones(len(stamps_ns))
+    sigma = np.sqrt(0.5 * (cov_map[:, 0, 0] + cov_map[:, 1, 1]))
+    rough = sigma > ROUGH_RATIO * np.quantile(sigma, BETTER)
+    if not rough.any():
+        return out
+    step_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+    edges = np.flatnonzero(np.diff(rough.astype(int), prepend=0, append=0))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        out[begin:end] = max(1.0, min(2.0 * ROUGH_TIME_S / step_s, end - begin))
+    return out
 
 
 def places_in_map(

@@ -154,7 +154,8 @@ def standing_gyro(
         if positions is not None:
             inside = (positions.stamps_ns >= begin) & (positions.stamps_ns < begin + window)
             if inside.sum() >= MIN_FIXES:
-                sigma = float(np.sqrt(positions.cov_map[inside].diagonal(axis1=1, axis2=2).max()))
+                of_one = positions.cov_map[inside].diagonal(axis1=1, axis2=2)
+                sigma = float(np.sqrt((of_one.T / positions.shared[inside]).max()))
                 # Means of the two halves: noise averages out, motion does not.
                 path = positions.position_map[inside, :2]
                 half = len(path) // 2

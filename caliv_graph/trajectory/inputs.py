@@ -290,6 +290,7 @@ def _positions(
             stamps_ns=stamps[within],
             position_map=positions.position_map[within],
             cov_map=positions.cov_map[within],
+            shared=positions.shared[within],
         )
         return positions, gravity, list(lines)
     span = "the IMU's span" if motion.imu is not None else "the span of the velocities"

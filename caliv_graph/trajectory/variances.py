@@ -153,8 +153,11 @@ def estimated_scales(
     typed += [SECOND_ARM] if data.baselines is not None else []
     columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)
     bridged = iter(bridged_s(data.inertial, nodes) > 0.0)
-    # What happens in a gap is no noise of the IMU.
+    # What happens in a gap is no noise of the IMU, and the errors of rough fixes are not white.
     kinds = ["gap" if kind == "imu" and next(bridged) else kind for kind in graph.kinds]
+    if data.positions is not None:
+        rough = iter((data.positions.shared[graph.fixes] > 1.0).tolist())
+        kinds = ["rough fix" if kind == "gnss" and next(rough) else kind for kind in kinds]
     likelihood = NoiseLikelihood(
         graph.factors.linearize(values),
         kinds,

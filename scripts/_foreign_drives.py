@@ -162,11 +162,15 @@ def _place_targets(
     within = np.clip(vertices[:, :2], [ground.xs[0], ground.ys[0]], [ground.xs[-1], ground.ys[-1]])
     crowd = cKDTree(vertices[vertices[:, 2] - ground.z(within) > 0.05, :2])
     places: list[Array] = []
+    middle = (path.min(0) + path.max(0)) / 2
+    half = path.max(0) - middle + scenario.clear_m
     for shape in scenario.targets:
         best, score = path[0] + 6, -1.0
         for _ in range(TARGET_TRIES):
             xy = rng.uniform(path.min(0) - 7, path.max(0) + 7)
             others = [np.linalg.norm(xy - place[:2]) for place in places]
+            if scenario.style == "hall" and not (np.abs(xy - middle) < half - 0.8).all():
+                continue  # beyond its walls
             if (
                 near.query(xy)[0] < least_m
                 or crowd.query(xy)[0] < 1.8

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -20,6 +21,11 @@ Vehicle = Literal["car", "truck", "robot"]
 
 CAR = Body()
 
+_Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+CABIN_M: _Box = ((2.0, 0.0, 1.8), (7.4, 2.3, 2.6))
+"""Centre and size of a cabin and its load, which hide what is behind them."""
+
 T = TypeVar("T")
 
 
@@ -29,7 +35,7 @@ class _Size:
 
     Attributes:
         body: its springs and axles.
-        reach_m: corners of the box of places for LiDARs, in the axle frame.
+        reach_m: lowest and highest place of a LiDAR, in the axle frame.
         speed_m_s: slowest and fastest.
         curvature: of a bend at most, 1/m.
         seconds: shortest and longest course.
@@ -37,7 +43,7 @@ class _Size:
     """
 
     body: Body
-    reach_m: tuple[tuple[float, float, float], tuple[float, float, float]]
+    reach_m: _Box
     speed_m_s: tuple[float, float]
     curvature: float
     seconds: tuple[float, float]
@@ -46,7 +52,7 @@ class _Size:
 
 SIZES: dict[Vehicle, _Size] = {
     "car": _Size(CAR, ((-0.8, -0.9, 0.5), (3.7, 0.9, 1.9)), (1.5, 5.0), 0.16, (25, 50), 1.6),
-    "truck": _Size(TRUCK, ((-1.8, -1.3, 0.7), (6.0, 1.3, 3.3)), (1.5, 4.5), 0.09, (35, 60), 3.3),
+    "truck": _Size(TRUCK, ((-1.9, -1.4, 0.7), (6.0, 1.4, 3.4)), (1.5, 4.5), 0.09, (35, 60), 3.3),
     "robot": _Size(BOT, ((-0.2, -0.3, 0.3), (0.6, 0.3, 1.0)), (0.4, 1.1), 1.0, (25, 45), 1.1),
 }
 
@@ -78,7 +84,7 @@ class _Draw:
 def random_scenario(seed: int) -> Scenario:
     """Draws a kind of drive; the same for the same seed."""
     draw = _Draw(np.random.default_rng([20261129, seed]))
-    vehicle = draw.one_of(("car", "truck", "robot"), (0.6, 0.2, 0.2))
+    vehicle = draw.one_of(tuple(SIZES), (0.6, 0.2, 0.2))
     size = SIZES[vehicle]
     segments = _segments(draw, size)
     style = _style(draw, vehicle)
@@ -87,13 +93,14 @@ def random_scenario(seed: int) -> Scenario:
     wheels = not odometry and (imu is None or draw.happens(0.7))
     targets = _targets(draw)
     duration_s = sum(segment[0] for segment in segments)
+    box_m = CABIN_M if vehicle == "truck" and draw.happens(0.7) else None
     return Scenario(
         segments,
-        _lidars(draw, vehicle, size),
+        _lidars(draw, size, box_m),
         style,
         clear_m=2.5 if style == "hall" else draw.within(4.0, 9.0),
         body=size.body,
-        box_m=_box(draw, vehicle),
+        box_m=box_m,
         base_m=_base(draw, size),
         imu=imu,
         gnss=None if odometry else _gnss(draw, size, duration_s),
@@ -165,34 +172,42 @@ def _targets(draw: _Draw) -> tuple[str, ...]:
     return tuple(draw.one_of(sorted(TARGETS)) for _ in range(count))
 
 
-def _lidars(draw: _Draw, vehicle: Vehicle, size: _Size) -> dict[str, Lidar]:
+def _lidars(draw: _Draw, size: _Size, box_m: _Box | None) -> dict[str, Lidar]:
     count = draw.one_of((1, 2, 3, 4), (0.1, 0.55, 0.25, 0.1))
     yaw_deg = draw.within(-180.0, 180.0)
     lidars = {}
     for i in range(count):
-        lidars[f"lidar_{i}"] = _lidar(draw, vehicle, size, yaw_deg)
+        spot_m = draw.spot(*size.reach_m)
+        while box_m is not None and _is_inside(spot_m, box_m):
+            spot_m = draw.spot(*size.reach_m)
+        lidars[f"lidar_{i}"] = _lidar(draw, spot_m, yaw_deg)
         yaw_deg += draw.within(60.0, 180.0)
     return lidars
 
 
-def _lidar(draw: _Draw, vehicle: Vehicle, size: _Size, yaw_deg: float) -> Lidar:
+def _is_inside(spot_m: tuple[float, float, float], box_m: _Box) -> bool:
+    """Also within a hand of its faces: nobody mounts a LiDAR flush."""
+    centre_m, size_m = np.array(box_m)
+    return bool((np.abs(spot_m - centre_m) < size_m / 2 + 0.1).all())
+
+
+def _lidar(draw: _Draw, place: tuple[float, float, float], yaw_deg: float) -> Lidar:
     kinds: tuple[Kind, ...] = ("spinning", "solid", "rosette", "dome")
     kind = draw.one_of(kinds, (0.6, 0.2, 0.08, 0.12))
-    low_m, high_m = size.reach_m
     yaw_deg = (yaw_deg + 180.0) % 360.0 - 180.0
     roll_deg, pitch_deg = draw.within(-5.0, 5.0), draw.within(-3.0, 12.0)
     if kind == "spinning" and draw.happens(0.1):
         roll_deg += draw.one_of((180.0, 90.0))
     times: tuple[TimeField, ...] = ("t", "time", "timestamp", "offset_time")
-    common = {
-        "phase_s": draw.within(0.0, 0.09),
-        "noise_m": draw.log(0.003, 0.02),
-        "quantum_m": draw.one_of((0.001, 0.002, 0.004)),
-        "divergence_rad": draw.log(0.0004, 0.0025),
-        "max_range_m": draw.within(40.0, 120.0),
-        "time_field": draw.one_of(times),
-    }
-    place = draw.spot(low_m, high_m)
+    common = partial(
+        Lidar,
+        phase_s=draw.within(0.0, 0.09),
+        noise_m=draw.log(0.003, 0.02),
+        quantum_m=draw.one_of((0.001, 0.002, 0.004)),
+        divergence_rad=draw.log(0.0004, 0.0025),
+        max_range_m=draw.within(40.0, 120.0),
+        time_field=draw.one_of(times),
+    )
     turned = (round(roll_deg, 2), round(pitch_deg, 2), round(yaw_deg, 2))
     if kind == "spinning":
         channels = draw.one_of((16, 32, 64, 128))
@@ -200,25 +215,16 @@ def _lidar(draw: _Draw, vehicle: Vehicle, size: _Size, yaw_deg: float) -> Lidar:
         fov = (-15.0, 15.0) if channels == 16 else (-half_deg, draw.within(10.0, 22.5))
         # 45,000 beams a sweep at most: 128 channels have fewer columns.
         columns = {16: 1800, 32: 1024, 64: 700, 128: 350}[channels]
-        return Lidar(place, turned, kind, channels, fov, columns=columns, **common)
+        return common(place, turned, kind, channels, fov, columns=columns)
     if kind == "solid":
         rows = draw.one_of((60, 90, 110))
-        return Lidar(place, turned, kind, rows, columns=400, **common)
+        return common(place, turned, kind, rows, columns=400)
     if kind == "rosette":
-        return Lidar(place, turned, kind, 20, (-35.0, 35.0), columns=1000, **common)
+        return common(place, turned, kind, 20, (-35.0, 35.0), columns=1000)
     upside_down = draw.happens(0.5)
     if upside_down:
         turned = (turned[0] + 178.0, turned[1], turned[2])
-    return Lidar(place, turned, kind, 20, (-7.0, 52.0), columns=1000, **common)
-
-
-def _box(
-    draw: _Draw, vehicle: Vehicle
-) -> tuple[tuple[float, float, float], tuple[float, float, float]] | None:
-    """A cabin or load that hides what is behind it."""
-    if vehicle == "truck" and draw.happens(0.7):
-        return (2.0, 0.0, 1.8), (7.4, 2.3, 2.6)
-    return None
+    return common(place, turned, kind, 20, (-7.0, 52.0), columns=1000)
 
 
 def _base(draw: _Draw, size: _Size) -> tuple[float, float, float]:

@@ -51,7 +51,7 @@ UNMEASURED_M_S2 = 1e3
 
 @dataclass
 class TrajectoryGraph:
-    """The factors, and the kind of each, of `KINDS`."""
+    """The factors, the kind of each, of `KINDS`, and which fix each one of GNSS is."""
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     kinds: list[str] = field(default_factory=list)

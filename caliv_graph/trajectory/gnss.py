@@ -13,7 +13,6 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, GnssFixes, IntArray
 from caliv_graph.trajectory.noise import gnss_covariances
 
-
 ROUGH_RATIO = 3.0
 """Fixes that state this many times the sigma of the better ones are rough: the receiver has lost
 its fixed ambiguities, or sees reflections."""
@@ -82,8 +81,8 @@ def shared_by_rough(stamps_ns: IntArray, cov_map: Array) -> Array:
     """(n,) factors on stated covariances (n, 3, 3) of fixes for errors that rough ones share.
 
     Within a run of m rough fixes, dt apart, errors of correlation time T leave as much to their
-    mean as independent ones of 2 T / dt times the variance do, and m times is all that can be. Fixes
-    are rough by their horizontal sigma.
+    mean as independent ones of 2 T / dt times the variance do, and m times is all that can be.
+    Fixes are rough by their horizontal sigma.
     """
     out = np.ones(len(stamps_ns))
     sigma = np.sqrt(0.5 * (cov_map[:, 0, 0] + cov_map[:, 1, 1]))

@@ -240,11 +240,9 @@ class SmoothedTrajectory:
             TrajectoryError: a stamp is outside the span.
         """
         R, p, v = self._imu_states(within_span(stamps_ns, self.span_ns, "its span"))
-        biases = (
-            interpolate(stamps_ns, self.nodes_ns, bias)
-            for bias in (self.states.force_bias, self.states.gyro_bias)
-        )
-        return States(R, p, v, *biases, self.states.yaw_bias_rad)
+        force_bias = interpolate(stamps_ns, self.nodes_ns, self.states.force_bias)
+        gyro_bias = interpolate(stamps_ns, self.nodes_ns, self.states.gyro_bias)
+        return States(R, p, v, force_bias, gyro_bias, self.states.yaw_bias_rad)
 
     def _imu_states(self, stamps: IntArray) -> tuple[Array, Array, Array]:
         """R_map_imu, its origin and its velocity in the map."""

@@ -21,6 +21,7 @@ from scripts import benchmark_foreign as benchmark
 from scripts._foreign_draws import EFFECTS, Draws
 from scripts._foreign_drives import SCENARIOS, simulate
 from scripts._foreign_lidar import Kind, Lidar, Scene, Sweep, scan
+from scripts._foreign_random import in_words, random_scenario
 from scripts._foreign_vehicle import Gnss, Imu, Motion, measure_gnss, measure_imu
 from scripts._foreign_world import Array, Grass, Ground, Mesh
 
@@ -199,3 +200,16 @@ def test_the_errors_of_a_run_are_shown_with_sigmas() -> None:
     assert "z " not in row
     assert row.endswith("NEES 20.0 of 5, worst 2.0 sigmas")
     assert undetermined == "  not determined: height"
+
+
+def test_a_random_drive_is_the_same_for_the_same_seed_and_has_room_for_its_lidars() -> None:
+    for seed in range(1, 60):
+        scenario = random_scenario(seed)
+        assert scenario == random_scenario(seed)
+        assert in_words(scenario) == in_words(random_scenario(seed))
+        assert scenario.gnss is not None or scenario.odometry
+        if scenario.box_m is not None:
+            centre, size = np.array(scenario.box_m)
+            for lidar in scenario.lidars.values():
+                assert (np.abs(lidar.xyz_m - centre) > size / 2 + 0.05).any()
+    assert len({in_words(random_scenario(seed)) for seed in range(1, 60)}) == 59

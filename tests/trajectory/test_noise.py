@@ -10,7 +10,7 @@ import pytest
 
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import GnssFixes, ImuSamples, TwistSamples
-from caliv_graph.trajectory.gnss import normal_gravity, positions_in_map
+from caliv_graph.trajectory.gnss import normal_gravity, positions_in_map, shared_by_rough
 from caliv_graph.trajectory.noise import (
     gnss_covariances,
     imu_noise,
@@ -130,3 +130,30 @@ def test_gnss_figures_of_the_config_leave_the_messages_alone() -> None:
     assert out[:, 2, 2].tolist() == [9.0] * N
     assert out[:, 0, 0].tolist() == [0.04] * N
     assert stated_cov[0, 2, 2] == 0.09
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "rough", "sigmas_m", "factor"),
+    [
+        # 10 Hz, 3 s of 10 cm: with errors of 10 s 30 fixes are one fix; at 1 Hz 60 are three.
+        (10.0, slice(20, 50), (0.1, 0.1, 0.1), 30.0),
+        (1.0, slice(20, 80), (0.1, 0.1, 0.1), 20.0),
+        (10.0, slice(20, 21), (0.1, 0.1, 0.1), 1.0),  # alone it is as it says
+        (10.0, slice(20, 50), (0.029, 0.029, 0.029), 1.0),
+        (10.0, slice(20, 50), (0.01, 0.01, 0.1), 1.0),  # poor in height alone
+        (0.05, slice(20, 50), (0.1, 0.1, 0.1), 1.0),  # one in 20 s
+    ],
+)
+def test_fixes_that_state_much_more_than_the_better_ones_count_as_few(
+    rate_hz: float, rough: slice, sigmas_m: tuple[float, float, float], factor: float
+) -> None:
+    at = np.round(np.arange(100) / rate_hz * 1e9).astype(np.int64)
+    cov = np.tile(np.eye(3) * 0.01**2, (100, 1, 1))
+    cov[rough] = np.diag(sigmas_m) ** 2
+    expected = np.ones(100)
+    expected[rough] = factor
+
+    np.testing.assert_allclose(shared_by_rough(at, cov), expected)
+    fixes = GnssFixes(at, np.full(100, 48.0), np.full(100, 11.0), np.full(100, 500.0), cov)
+    positions, _ = positions_in_map(fixes, CONFIG, "drive/")
+    np.testing.assert_allclose(positions.cov_map, expected[:, None, None] * cov)

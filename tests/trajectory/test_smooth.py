@@ -457,6 +457,27 @@ def test_a_receiver_worse_than_the_papers_is_noticed() -> None:
     assert np.sqrt(cov[:, 3, 3]).min() > 0.02
 
 
+def test_fixes_without_ambiguities_bend_the_trajectory_no_more_than_one_of_them() -> None:
+    """Six seconds that state 15 cm and are all off by as much."""
+    motion = record(ROUGH, AWKWARD, 6)
+    assert motion.gnss is not None
+    t = seconds(motion.gnss.stamps_ns)
+    rough = (t > 10.0) & (t < 16.0)
+    sigma = np.where(rough, 0.15, 0.0167)
+    stated = sigma[:, None, None] ** 2 * np.eye(3)
+    north = motion.gnss.latitude_deg + np.where(rough, 0.15 / 111_200.0, 0.0)
+    motion = replace(motion, gnss=replace(motion.gnss, latitude_deg=north, cov_enu=stated))
+
+    wanted = stamps(ROUGH.duration_s, 5.0, 0.0512)
+    smoothed = smooth_trajectory(motion, config_for(AWKWARD), wanted)
+
+    nees, _, shift = whitened(ROUGH, motion, smoothed)
+    assert np.abs(shift[:, 1]).max() < 0.02  # 0.032 if they were independent
+    assert nees.max() < 20.0  # 27
+    # What they err by does not count as noise of the sound ones.
+    assert "gnss_horizontal" not in smoothed.data.scales
+
+
 def test_an_outage_of_the_gnss_widens_the_covariance_there() -> None:
     motion = record(ROUGH, AWKWARD, 6)
     gnss = motion.gnss

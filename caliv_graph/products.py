@@ -348,6 +348,8 @@ class GroundObservation:
         R_map_vehicle: (3, 3) of the pose at `stamp_ns` by which it was turned; None likewise.
         repeated: (3,) variances of (a, b, distance) beside `cov` with which it counts for the part
             of what it shares with other scans; None: it shares nothing.
+        bent: part of the scans of its drive in which the ground is bent, of the LiDAR that finds it
+            so most often.
     """
 
     lidar: str
@@ -368,6 +370,7 @@ class GroundObservation:
     twist_map: Array | None = None
     R_map_vehicle: Array | None = None
     repeated: Array | None = None
+    bent: float = 0.0
 
 
 @dataclass(frozen=True)

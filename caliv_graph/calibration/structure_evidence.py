@@ -45,6 +45,9 @@ KEPT_POSES = 40
 """Poses of a drive without a target that the calibration keeps, for the ground: spread over the
 drive, their views of it differ. All other poses of its structure are eliminated before."""
 
+MOST_BENT = 0.4
+"""Part of the scans in which a LiDAR finds the ground bent; beyond, strips alone stand for it."""
+
 MOST_GIVEN = 50
 """Given poses of a drive that its structure tells the errors of: the cost grows with their cube."""
 
@@ -372,9 +375,17 @@ def other_grounds(
 
     In the terms it is cell by cell. The planes of all LiDARs in its place claim too much: they take
     what scans from other places share of the ground, such as bumps, as independent.
+
+    Planes are none where the ground is bent. A LiDAR that sees it on one side only finds a plane on
+    the slope of a cambered road, in all its scans, and it is not that on which the vehicle stands.
     """
     within = {(term.drive, name) for term in terms for name in term.ground}
-    return tuple(o for o in grounds if (o.drive, o.lidar) not in within)
+    drives = {drive for drive, _ in within}
+    return tuple(
+        o
+        for o in grounds
+        if (o.drive, o.lidar) not in within and not (o.drive in drives and o.bent > MOST_BENT)
+    )
 
 
 NO_STRUCTURE = StructureEvidence()

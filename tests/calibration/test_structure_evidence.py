@@ -60,6 +60,18 @@ def test_ground_of_a_lidar_is_in_strips_or_in_planes(
     assert other_grounds(elsewhere, (term,)) == elsewhere
 
 
+def test_where_the_ground_is_bent_strips_alone_stand_for_it() -> None:
+    trajectory = given()
+    term = term_of(trajectory, trajectory.trajectory.stamps_ns, ("front", "rear"))
+    some, none = (replace(term, ground=frozenset(names)) for names in (["front"], []))
+    bent = (replace(plane("rear"), bent=0.5),)
+
+    assert other_grounds(bent, (some,)) == ()
+    assert other_grounds(bent, (none,)) == bent  # planes are all that is known of it
+    hardly = (replace(plane("rear"), bent=0.2),)
+    assert other_grounds(hardly, (some,)) == hardly
+
+
 def test_what_no_target_has_placed_is_not_held_and_keeps_its_pieces_of_ground() -> None:
     """A solve that had structure has LiDARs that saw no target: a second one begins at it."""
     case = make_case("front", "rear", "left")

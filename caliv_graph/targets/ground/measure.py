@@ -23,6 +23,7 @@ from caliv_graph.products import (
     TargetObservation,
 )
 from caliv_graph.targets.ground.planes import (
+    BENT,
     MIN_SLOPE,
     fit_plane,
     ground_floors,
@@ -39,6 +40,10 @@ points during a sweep is linear far beyond it."""
 MAX_APART_NS = 60_000_000
 """Maximum time between a scan and the pose that it is used for. Every LiDAR of 10 Hz has a scan
 within half its period, over which any trajectory is right to 1 mm."""
+
+
+FEWEST_JUDGED = 8
+"""Scans of a LiDAR with ground that is a plane or bent, to say how often it is bent."""
 
 
 class GroundMeter:
@@ -133,6 +138,19 @@ class GroundMeter:
             twist_map=turned_twist(R_map_vehicle, twist),
             R_map_vehicle=R_map_vehicle,
         )
+
+    def bent(self) -> float:
+        """Part of the scans in which the ground is bent, of the LiDAR that finds it so most often.
+
+        Counted are scans with a plane and bent ones.
+        """
+        parts = [0.0]
+        for name, reasons in self._without.items():
+            bent = reasons[BENT]
+            judged = self._scans[name] - sum(reasons.values()) + bent
+            if judged >= FEWEST_JUDGED:
+                parts.append(bent / judged)
+        return max(parts)
 
     def warnings(self) -> tuple[str, ...]:
         """LiDARs that have no ground in most of their scans, and the reasons, a line each."""
@@ -235,4 +253,6 @@ def measure_grounds(
                 if observation is not None:
                     found.append(observation)
                 advance()
-    return tuple(found), tuple(line for meter in meters for line in meter.warnings())
+    bent = [meter.bent() for meter in meters]
+    observations = tuple(replace(o, bent=bent[o.drive]) for o in found)
+    return observations, tuple(line for meter in meters for line in meter.warnings())

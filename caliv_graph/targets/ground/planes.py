@@ -80,6 +80,9 @@ MAX_BEND_M = 0.004
 """Maximum root mean square of the best paraboloid over the patch, less its best plane: asphalt
 bends by millimetres over 30 m, the foot of a ramp by centimetres."""
 
+BENT = "the ground near the vehicle is bent"
+"""Why it is no plane then."""
+
 MIN_POINTS = 60
 """Minimum number of points on the plane."""
 
@@ -303,7 +306,7 @@ def _judged(
     centre = np.average(fit.place[on_plane], axis=0, weights=weight)
     bend_m, beyond = _bend(J[:, :2], height, weight)
     if bend_m > MAX_BEND_M:
-        return None, "the ground near the vehicle is bent"
+        return None, BENT
     # Huber's sandwich covariance of an M-estimate: from the scatter, not from the assumed noise.
     curvature = (1.0 - part) * (1.0 - 5.0 * part) / sigma_m**2
     bread = (J * curvature[:, None]).T @ J

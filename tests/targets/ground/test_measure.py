@@ -38,7 +38,7 @@ from caliv_graph.trajectory.deskew import deskewed
 from caliv_graph.trajectory.given import given_trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.samples import pose
-from tests.targets.ground.scans import HEIGHT_M, beams, level, scan_of
+from tests.targets.ground.scans import HEIGHT_M, beams, level, scan_of, terrain
 
 ROOT = Path(__file__).parents[3]
 RELEASED = ROOT.parent / "shared" / "data" / "caliv_released"
@@ -226,6 +226,21 @@ def test_meter_says_why_there_is_no_ground() -> None:
         "ground: lidar 'front' has it in 1 of 3 scans of drive 2: "
         "2 under 60 points near the ground",
     )
+
+
+def test_meter_says_how_often_the_ground_is_bent() -> None:
+    lidar = {"topic": "a", "initial": {"xyz": [0, 0, 2], "rpy_deg": [0, 10.0, 0]}}
+    lidars = {name: lidar | {"topic": name} for name in ("front", "rear")}
+    meter = GroundMeter(parse_config({"lidars": lidars}, "made up", Path()), pitching(0.0), 0)
+    flat = scan_of(level)
+    bent = scan_of(terrain(lambda x: x**2 / 200.0), sigma_m=0.01)
+    for n in range(10):
+        assert meter.measure(replace(flat, lidar="rear", stamp_ns=n)) is not None
+        measured = meter.measure(replace(bent if n < 6 else flat, stamp_ns=n))
+        assert (measured is None) == (n < 6)
+    # Scans that show no ground say nothing of its shape.
+    assert meter.measure(LidarScan("front", 11, np.zeros((0, 3)), "empty")) is None
+    assert meter.bent() == pytest.approx(0.6)
 
 
 def test_meter_refuses_stamps_outside_the_trajectory() -> None:

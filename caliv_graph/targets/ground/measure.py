@@ -27,6 +27,7 @@ from caliv_graph.targets.ground.planes import (
     MIN_SLOPE,
     fit_plane,
     ground_floors,
+    is_passed,
     near_points,
     response,
 )
@@ -106,6 +107,8 @@ class GroundMeter:
         by_guess = deskewed(part, [guess, *rotated], self._trajectory)
         points = next(by_guess)
         plane, reason = fit_plane(points, up_lidar, self._sigma_range_m)
+        if plane is not None and is_passed(plane, scan.points_lidar):
+            plane, reason = None, "beams pass through the plane, to what is lower"
         if plane is None:
             self._without[scan.lidar][reason] += 1
             return None

@@ -76,6 +76,10 @@ MAX_BELOW = 0.1
 """Maximum part of the points that are lower than `NEARLY_M` below the plane. Above it, the plane is
 not the ground, or the ground falls off."""
 
+MAX_PASSED = 0.1
+"""Maximum part of the square metres with points on the plane that beams pass through beside them,
+to what is lower. Above it, the plane is the vehicle's roof, a deck, or the edge of a platform."""
+
 MAX_BEND_M = 0.004
 """Maximum root mean square of the best paraboloid over the patch, less its best plane: asphalt
 bends by millimetres over 30 m, the foot of a ramp by centimetres."""
@@ -345,6 +349,26 @@ def _is_determined(cov: Array) -> bool:
         and tilts[1] < MAX_NORMAL_SIGMA_RAD**2
         and 0.0 <= cov[2, 2] < MAX_DISTANCE_SIGMA_M**2
     )
+
+
+def is_passed(plane: GroundPlane, points: Array) -> bool:
+    """Whether beams to points (N, 3) of the scan pass through a plane where it would have ground.
+
+    All points count, also those beyond the radius of the fit: from 20 cm above a roof the ground is
+    seen tens of metres away. They need no motion compensation.
+    """
+    height = points @ plane.normal_lidar + plane.distance_m
+    sinks = height - plane.distance_m < -MIN_SLOPE * np.linalg.norm(points, axis=1)
+    on, below = np.abs(height) < STANDING_M[0], height < -NEARLY_M
+    met = (on | below) & sinks
+    # From the LiDAR at the height of the distance, the beam is at zero here.
+    part = plane.distance_m / (plane.distance_m - height[met])
+    place = part[:, None] * points[met] @ plane.axes_lidar.T
+    near = np.einsum("ni,ni->n", place, place) < plane.radius_m**2
+    cells, below = _cells(place[near], CELL_M), below[met][near]
+    ground = np.unique(cells[~below])
+    passed = np.setdiff1d(cells[below], ground)
+    return len(passed) > MAX_PASSED * len(ground)
 
 
 def _bend(place: Array, height: Array, weight: Array) -> tuple[float, Array]:

@@ -38,7 +38,14 @@ from caliv_graph.trajectory.deskew import deskewed
 from caliv_graph.trajectory.given import given_trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.samples import pose
-from tests.targets.ground.scans import HEIGHT_M, beams, level, scan_of, terrain
+from tests.targets.ground.scans import (
+    HEIGHT_M,
+    beams,
+    level,
+    plateau,
+    scan_of,
+    terrain,
+)
 
 ROOT = Path(__file__).parents[3]
 RELEASED = ROOT.parent / "shared" / "data" / "caliv_released"
@@ -226,6 +233,27 @@ def test_meter_says_why_there_is_no_ground() -> None:
         "ground: lidar 'front' has it in 1 of 3 scans of drive 2: "
         "2 under 60 points near the ground",
     )
+
+
+def test_the_roof_below_a_lidar_is_no_ground() -> None:
+    meter = GroundMeter(CONFIG, pitching(0.0), 0)
+    roof = plateau(0.3, 4.0, 3.0, HEIGHT_M - 0.2)
+
+    # Beams that clear its edges meet the ground, 2 m below and more than 20 m away.
+    assert meter.measure(scan_of(level, roof, directions=beams(400, 80))) is None
+    assert meter.warnings()[0].endswith("1 beams pass through the plane, to what is lower")
+
+
+def test_ground_with_a_shaft_is_ground() -> None:
+    def shaft(directions: Array) -> Array:
+        """Half a metre square, 6 m ahead, a metre deep."""
+        foot = level(directions)[:, None] * directions
+        inside = (np.abs(foot[:, 0] - 6.0) < 0.25) & (np.abs(foot[:, 1]) < 0.25)
+        return np.where(inside, 1.5 * level(directions), level(directions))
+
+    found = GroundMeter(CONFIG, pitching(0.0), 0).measure(scan_of(shaft))
+    assert found is not None
+    assert found.distance_m == pytest.approx(HEIGHT_M, abs=1e-3)
 
 
 def test_meter_says_how_often_the_ground_is_bent() -> None:

@@ -212,7 +212,7 @@ def test_channels_that_differ_move_no_lidar() -> None:
 def test_each_channel_has_its_error_where_channels_are_seen() -> None:
     """The same, with what the points of each channel add: their ranges are found."""
     noise = Noise(bump_m=0.001, bias_m=0.0, channel_m=0.01)
-    problem = problem_of(yard(), figure_eight(20), 3, noise)
+    problem = problem_of(yard(), figure_eight(14), 3, noise)
     nodes = beam_nodes(problem.patches)
     assert all(of.channels and of.errors.kinds == CHANNEL_KINDS for of in nodes)
     found = solve(replace(problem, beam_nodes=nodes))

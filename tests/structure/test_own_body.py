@@ -84,7 +84,7 @@ EIGHT = driven(eight_drive())
 
 def read(world: World, trajectory: GivenTrajectory, body: World | None) -> DrivePatches:
     begin, end = trajectory.span_ns
-    stamps = np.arange(begin + 100_000_000, end, 1_000_000_000, dtype=np.int64)
+    stamps = np.arange(begin + 100_000_000, end, 1_500_000_000, dtype=np.int64)
     spinners = lidars(body)
     recording = recorded(world, trajectory, spinners, dict.fromkeys(spinners, stamps))
     (patches,) = read_patches([recording], [trajectory], CONFIG, SilentProgress(), keep_level=True)

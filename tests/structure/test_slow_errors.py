@@ -24,7 +24,7 @@ from caliv_graph.structure.thinning import FEW_SCANS
 from tests.structure.test_solve import problem_of, solve
 from tests.structure.yards import STEP_NS, figure_eight, yard
 
-POSES = 100
+POSES = 60
 
 
 def test_a_moved_prior_is_eliminated_as_from_the_joint_quadratic() -> None:
@@ -108,9 +108,9 @@ def test_a_lidar_without_sightings_is_not_put_at_its_guess() -> None:
 def test_few_scans_of_the_first_part_are_used() -> None:
     patches = past_walls().patches
 
-    used = scans_for_errors(patches, 120 * STEP_NS)
+    used = scans_for_errors(patches, 50 * STEP_NS)
 
-    assert used.stamps_ns.max() <= 120 * STEP_NS
+    assert used.stamps_ns.max() <= 50 * STEP_NS
     for lidar in range(2):
         count = np.count_nonzero(used.scan_lidar == lidar)
         assert FEW_SCANS <= count <= FEW_SCANS + 11

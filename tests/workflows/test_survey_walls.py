@@ -39,7 +39,7 @@ OBLIQUE = {"left": wall(8, 8, 25, 8.0, 1), "right": wall(8, -8, 30, 8.0, 2)}
 
 def coarse(x_m: float, yaw_deg: float) -> LidarModel:
     return paper_lidar(x_m, yaw_deg, rate_hz=1.6).model_copy(
-        update={"channels": 50, "horizontal_resolution_deg": 0.6}
+        update={"channels": 40, "horizontal_resolution_deg": 0.75}
     )
 
 

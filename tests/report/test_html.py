@@ -97,7 +97,10 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     folder = tmp_path_factory.mktemp("bag") / EVIL_FOLDER
     scenario = load_scenario(ROOT / "configs/scenarios/demo_arc.yaml")
     slow = {n: m.model_copy(update={"rate_hz": 1.25}) for n, m in scenario.lidars.items()}
-    write_drive(scenario.model_copy(update={"lidars": slow}), folder, 1, threads=1)
+    assert scenario.crop is not None
+    crop = scenario.crop.model_copy(update={"elsewhere_stride": 12})
+    few = scenario.model_copy(update={"lidars": slow, "crop": crop})
+    write_drive(few, folder, 1, threads=1)
     config = without_structure(load_config(folder / "config.yaml"))
     blind = config.lidars["front"].model_copy(update={"min_range": 400.0, "max_range": 450.0})
     lidars = {**config.lidars, EVIL: blind}

@@ -56,11 +56,14 @@ def test_the_main_job_is_done_and_explained(
         _demo, "subprocess", SimpleNamespace(run=in_this_process, CalledProcessError=error)
     )
     out = tmp_path / "out"
-    # The arc with a quarter of its clouds.
+    # The arc with a quarter of its clouds, and a ninth of their points elsewhere.
     scenario = tmp_path / "demo_arc.yaml"
     text = (ROOT / "configs/scenarios/demo_arc.yaml").read_text(encoding="utf-8")
     assert text.count("rate_hz: 5.0") == 2
-    scenario.write_text(text.replace("rate_hz: 5.0", "rate_hz: 1.25"), encoding="utf-8")
+    assert text.count("elsewhere_stride: 4 ") == 1
+    text = text.replace("rate_hz: 5.0", "rate_hz: 1.25")
+    text = text.replace("elsewhere_stride: 4 ", "elsewhere_stride: 12 ")
+    scenario.write_text(text, encoding="utf-8")
     monkeypatch.setattr(_demo, "SCENARIO", scenario)
 
     assert run(monkeypatch, "--out", out) == 0

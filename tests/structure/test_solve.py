@@ -136,13 +136,13 @@ def test_a_mount_that_slips_is_found(solved: Solved) -> None:
     for name in ("front", "rear"):
         by = np.array([0.002, -0.003, 0.015, 0.01, -0.02, 0.0])
         own = list(TRUE).index(name)
-        problem = problem_of(yard(), figure_eight(24), 1, slip=Slip((own,), 12, by))
+        problem = problem_of(yard(), figure_eight(18), 1, slip=Slip((own,), 9, by))
         found = solve(problem)
         assert found.slips is not None
         slip = found.slips.slip()
         assert (slip.lidars, slip.others) == ((name,), ())
-        assert slip.since_s == pytest.approx(12 * STEP_NS * 1e-9)
-        assert slip.lasts_s == pytest.approx(23 * STEP_NS * 1e-9)
+        assert slip.since_s == pytest.approx(9 * STEP_NS * 1e-9)
+        assert slip.lasts_s == pytest.approx(17 * STEP_NS * 1e-9)
         assert slip.sigmas > 10.0
         start = dict(zip(TRUE, found.state.T_vehicle_lidar, strict=True))
         measured = measured_slip(problem, start, slip)

@@ -10,6 +10,10 @@ map where these patches lie, LiDARs see ground well below them, a little before 
 ground stands still in the frame of a LiDAR as well, on a flat drive all of it, and so do platforms,
 decks and pavements beside a straight way: but nothing is seen below them. Walls and ceilings are
 not looked at.
+
+Where the ground that is seen is sparse, or none of it lies where the vehicle drives, turns tell the
+same: a patch that is far above the level of the ground, and stays in one place of a LiDAR's frame
+while the vehicle turns, turns with it.
 """
 
 from __future__ import annotations
@@ -62,6 +66,16 @@ at its edge, where the incidence is at the limit, and where guesses leave open w
 CLEAR_M = 0.3
 """The body is higher than this above the ground that is seen below it. A high kerb, a step or a
 speed bump is lower."""
+
+RAISED_M = 0.5
+"""Without ground seen below it the body is higher than this above the ground's level."""
+
+GROUND_PART, GROUND_RANGE_M = 0.2, 10.0
+"""The ground's level in vehicle axes: the quantile of all level patches so near. Half of them may
+be on the body."""
+
+TURNED_RAD = 0.5
+"""The vehicle turns by this while a spot is seen: a platform beside its way has left it."""
 
 COLUMN_M = 0.3
 """Ground is looked for in columns of this width about a patch."""
@@ -117,8 +131,11 @@ def without_own_body(
     lidar = patches.scan_lidar[patches.scan]
     range_m = np.linalg.norm(patches.centres_lidar, axis=1)
     centres_map, level = _in_map(patches, trajectory, [g.T_vehicle_lidar for g in guesses])
+    heights_m, headings = _in_vehicle(patches, trajectory, [g.T_vehicle_lidar for g in guesses])
     tilt = np.array([guess.sigmas[:2].max() for guess in guesses])
     doubt_m = GUESS_SIGMAS * tilt[lidar] * range_m
+    near = level & (range_m < GROUND_RANGE_M)
+    ground_level_m = np.quantile(heights_m[near], GROUND_PART) if near.any() else np.inf
     of_body, found = np.zeros(len(lidar), dtype=bool), []
     for k, name in enumerate(patches.lidars):
         own = np.flatnonzero(level & (lidar == k))
@@ -131,7 +148,9 @@ def without_own_body(
         limit_m = centres_map[own, 2] - doubt_m[own] - CLEAR_M
         clear = _above_ground(column[own], limit_m, column[level], ground_m[level])
         here = places[patches.scan_lidar[places] == k]
-        own = own[_of_body(patches, own, clear, here)]
+        raised_m = heights_m[own] - doubt_m[own] - GUESS_SIGMAS * guesses[k].sigmas[5]
+        raised = raised_m > ground_level_m + RAISED_M
+        own = own[_of_body(patches, own, (clear, raised), here, headings)]
         if len(own):
             of_body[own] = True
             share = len(own) / int((lidar == k).sum())
@@ -170,6 +189,17 @@ def _in_map(
     return centres_map, np.einsum("nj,nj->n", R[which, 2], normals) > LEVEL_COS
 
 
+def _in_vehicle(
+    patches: DrivePatches, trajectory: VehicleTrajectory, T_vehicle_lidar: Sequence[gtsam.Pose3]
+) -> tuple[Array, Array]:
+    """(N,) heights of the patches in vehicle axes; (M,) heading at each scan, without jumps."""
+    R_own, t_own = (a[patches.scan_lidar[patches.scan]] for a in stack(T_vehicle_lidar))
+    heights_m = np.einsum("nj,nj->n", R_own[:, 2], patches.centres_lidar) + t_own[:, 2]
+    stamps, which = np.unique(patches.stamps_ns, return_inverse=True)
+    R, _ = trajectory.poses_at(stamps)
+    return heights_m, np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))[which]
+
+
 def _above_ground(at: Array, limit_m: Array, ground: Array, ground_m: Array) -> BoolArray:
     """(n,) whether ground lower than `limit_m` (n,) is seen below places, and all about them.
 
@@ -201,13 +231,21 @@ def _keys(cells: Array) -> IntArray:
     return np.asarray((part[:, 0] << 40) | (part[:, 1] << 20) | part[:, 2])
 
 
-def _of_body(patches: DrivePatches, own: IntArray, clear: BoolArray, places: IntArray) -> BoolArray:
+def _of_body(
+    patches: DrivePatches,
+    own: IntArray,
+    above: tuple[BoolArray, BoolArray],
+    places: IntArray,
+    headings: Array,
+) -> BoolArray:
     """(n,) which level patches `own` (n,) of one LiDAR are on the vehicle.
 
-    `clear` (n,) are those above ground that is seen; `places` its scans, one of each place.
+    `above` are those (n,) above ground that is seen, and those (n,) far above its level; `places`
+    its scans, one of each place; `headings` (M,) those of all scans.
     """
+    clear, raised = above
     of_body: BoolArray = np.zeros(len(own), dtype=bool)
-    if not clear.any() or len(places) < FEWEST_PLACES:
+    if not (clear | raised).any() or len(places) < FEWEST_PLACES:
         return of_body
     centres, normals = patches.centres_lidar[own], patches.normal_lidar[own]
     tree, scan = cKDTree(centres), patches.scan[own]
@@ -220,9 +258,11 @@ def _of_body(patches: DrivePatches, own: IntArray, clear: BoolArray, places: Int
     def seen(near: IntArray) -> float:
         return len(np.unique(scan[near[at_place[near]]])) / len(places)
 
-    for i in np.flatnonzero(clear).tolist():
+    for i in np.flatnonzero(clear | raised).tolist():
         spot = in_plane(i, SPOT_M)
-        of_body[i] = clear[spot].mean() >= CLEAR_PART and seen(spot) >= MOST
+        turns = raised[i] and np.ptp(headings[scan[spot]]) > TURNED_RAD
+        is_above = turns or clear[spot].mean() >= CLEAR_PART
+        of_body[i] = is_above and seen(spot) >= MOST
     left, tried = np.flatnonzero(of_body).tolist(), of_body.copy()
     while left:
         beside = in_plane(left.pop(), BESIDE_M)

@@ -7,6 +7,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.lidars import LidarConfig
@@ -188,6 +189,24 @@ def test_ground_is_below_a_place_where_it_is_seen_all_about_it() -> None:
     assert not above(x + y < 0.5)
     # Too few of them.
     assert not above(np.hypot(x, y) < 1.0)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_deck_below_which_no_ground_is_seen_turns_with_the_vehicle(way: str) -> None:
+    """The road that the vehicle drives on is out of view, as of LiDARs that look to the sides."""
+    trajectory, patches = WAYS[way], in_yard(way, deck=True)
+    deck = on_deck(patches)
+    _, at = trajectory.poses_at(np.unique(patches.stamps_ns))
+    spinners = lidars(None).values()
+    centres_map, level = _in_map(patches, trajectory, [s.T_vehicle_lidar for s in spinners])
+    road = level & ~deck & (cKDTree(at[:, :2]).query(centres_map[:, :2])[0] < 4.0)
+    aside = patches.part(~road)
+
+    left, found = without_own_body(aside, trajectory, CONFIG)
+
+    turns = way != "straight"
+    assert (on_deck(left).sum() <= 0.02 * deck.sum()) == turns
+    assert [body.lidar for body in found] == ["rear"] * turns
 
 
 def test_guesses_too_rough_to_tell_body_from_ground_leave_it() -> None:

@@ -358,7 +358,11 @@ class StructureEvidence:
             state.config,
             aligned=told.aligned,
             # A plane alone does not make a LiDAR part of a calibration: a target has to.
-            on_planes=frozenset((o.drive, o.lidar) for o in state.grounds if o.lidar in placed),
+            on_planes=frozenset(
+                (o.drive, o.lidar)
+                for o in state.grounds
+                if o.lidar in placed and o.bent <= MOST_BENT
+            ),
         )
 
 

@@ -169,6 +169,7 @@ def _gnss(
     if positions is None or len(positions.stamps_ns) < 2:
         return GnssModel(enabled=False)
     stamps = positions.stamps_ns
+    cov_of_one = positions.cov_map / positions.shared[:, None, None]
     rate_hz, phase_s = _rate_and_phase(stamps, begin_ns)
     latitude, longitude, altitude = positions.origin_deg_m
     x, y, z = (round(float(v), 4) for v in data.lever_arm)
@@ -176,8 +177,8 @@ def _gnss(
         lever_arm=(x, y, z + height_m),
         rate_hz=rate_hz,
         phase_s=phase_s,
-        horizontal_sigma_m=_sigma(positions.cov_map[:, :2, :2]),
-        vertical_sigma_m=_sigma(positions.cov_map[:, 2:, 2:]),
+        horizontal_sigma_m=_sigma(cov_of_one[:, :2, :2]),
+        vertical_sigma_m=_sigma(cov_of_one[:, 2:, 2:]),
         correlated_horizontal_sigma_m=0.0 if slow is None else _rounded(slow.sigmas[0]),
         correlated_vertical_sigma_m=0.0 if slow is None else _rounded(slow.sigmas[2]),
         correlation_s=TYPICAL_CORRELATION_S if slow is None else _rounded(slow.time_s),

@@ -12,8 +12,8 @@ decks and pavements beside a straight way: but nothing is seen below them. Walls
 not looked at.
 
 Where the ground that is seen is sparse, or none of it lies where the vehicle drives, turns tell the
-same: a patch that is far above the level of the ground, and stays in one place of a LiDAR's frame
-while the vehicle turns, turns with it.
+same: a patch that is far above the stated ground, and stays in one place of a LiDAR's frame while
+the vehicle turns, turns with it.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ RAISED_M = 0.5
 """Without ground seen below it the body is higher than this above the ground's level."""
 
 GROUND_PART, GROUND_RANGE_M = 0.2, 10.0
-"""The ground's level in vehicle axes: the quantile of all level patches so near. Half of them may
-be on the body."""
+"""The ground's level in vehicle axes is the stated one, or the quantile of all level patches so
+near, if that is higher: a stated height may be wrong. Half of the patches may be on the body."""
 
 TURNED_RAD = 0.5
 """The vehicle turns by this while a spot is seen: a platform beside its way has left it."""
@@ -136,6 +136,9 @@ def without_own_body(
     doubt_m = GUESS_SIGMAS * tilt[lidar] * range_m
     near = level & (range_m < GROUND_RANGE_M)
     ground_level_m = np.quantile(heights_m[near], GROUND_PART) if near.any() else np.inf
+    stated_m = config.ground.vehicle_height
+    # Beside a road on a bank most of what is seen may be lower than the road.
+    ground_level_m = np.inf if stated_m is None else max(ground_level_m, -stated_m)
     of_body, found = np.zeros(len(lidar), dtype=bool), []
     for k, name in enumerate(patches.lidars):
         own = np.flatnonzero(level & (lidar == k))

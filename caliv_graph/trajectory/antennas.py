@@ -127,7 +127,9 @@ def baselines_of(second: GnssFixes, first: Positions, config: Config, name: str)
         first.origin_deg_m,
     )
     vector = place - interpolate(stamps, first.stamps_ns, first.position_map)
-    return Baselines(stamps, vector, cov[kept] + first.cov_map[after][kept], source)
+    # What rough fixes of two antennas have in common is not in their difference.
+    cov_first = first.cov_map[after][kept] / first.shared[after][kept, None, None]
+    return Baselines(stamps, vector, cov[kept] + cov_first, source)
 
 
 def directions_of(

@@ -20,6 +20,9 @@ its fixed ambiguities, or sees reflections."""
 BETTER = 0.25
 """Quantile of the stated sigmas that stands for the better fixes."""
 
+ROUGH_M = 0.05
+"""And more than this: with fixed ambiguities 1 to 3 cm are stated, without 20 cm and more."""
+
 ROUGH_TIME_S = 10.0
 """Correlation time of the errors of rough fixes: float ambiguities and reflections last for seconds
 to minutes."""
@@ -86,7 +89,7 @@ def shared_by_rough(stamps_ns: IntArray, cov_map: Array) -> Array:
     """
     out = np.ones(len(stamps_ns))
     sigma = np.sqrt(0.5 * (cov_map[:, 0, 0] + cov_map[:, 1, 1]))
-    rough = sigma > ROUGH_RATIO * np.quantile(sigma, BETTER)
+    rough = sigma > max(ROUGH_M, ROUGH_RATIO * float(np.quantile(sigma, BETTER)))
     if not rough.any():
         return out
     step_s = float(np.median(np.diff(stamps_ns))) * 1e-9

@@ -14,7 +14,12 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, ImuSamples, MotionData
 from caliv_graph.trajectory.antennas import Baselines, Headings, directions_of
-from caliv_graph.trajectory.gnss import Positions, normal_gravity, positions_in_map
+from caliv_graph.trajectory.gnss import (
+    Positions,
+    normal_gravity,
+    positions_in_map,
+    shared_by_rough,
+)
 from caliv_graph.trajectory.imu import Inertial, clean_inertial
 from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
 from caliv_graph.trajectory.noise import (
@@ -285,12 +290,15 @@ def _positions(
     within = (stamps >= begin) & (stamps <= end)
     if within.any():
         # The others have no residuals: among those that judge the noise they would be perfect.
+        # What is rough is so beside those that remain.
+        cov = (positions.cov_map / positions.shared[:, None, None])[within]
+        shared = shared_by_rough(stamps[within], cov)
         positions = replace(
             positions,
             stamps_ns=stamps[within],
             position_map=positions.position_map[within],
-            cov_map=positions.cov_map[within],
-            shared=positions.shared[within],
+            cov_map=cov * shared[:, None, None],
+            shared=shared,
         )
         return positions, gravity, list(lines)
     span = "the IMU's span" if motion.imu is not None else "the span of the velocities"

@@ -113,12 +113,13 @@ def _with_fitting_noise(
     none, stated_by = np.zeros(0, dtype=np.int64), data.positions.source
     total = 1.0
     for _ in range(NOISE_ROUNDS):
-        squares = _squared_residuals(data, nodes, states)
+        assert data.positions is not None
+        # Of fixes that err together, each by what it states.
+        squares = _squared_residuals(data, nodes, states) * data.positions.shared
         if (squares > _final_limit(data.config)).mean() <= MAX_REJECTED:
             break
         factor = float(np.median(squares) / chdtri(3, 0.5))
         total *= factor
-        assert data.positions is not None
         positions = replace(data.positions, cov_map=data.positions.cov_map * factor)
         data = replace(data, positions=positions)
         states = solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE).states

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import gtsam
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.lidars import LidarConfig
-from caliv_graph.config.model import Config
+from caliv_graph.config.model import Config, GroundConfig
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, Trajectory
@@ -45,6 +46,9 @@ CONFIG = Config(
         for name, T in GUESSES.items()
     }
 )
+
+
+STATED = CONFIG.model_copy(update={"ground": GroundConfig(vehicle_height=0.0)})
 
 
 def lidars(body: World | None) -> dict[str, Spinner]:
@@ -202,11 +206,31 @@ def test_a_deck_below_which_no_ground_is_seen_turns_with_the_vehicle(way: str) -
     road = level & ~deck & (cKDTree(at[:, :2]).query(centres_map[:, :2])[0] < 4.0)
     aside = patches.part(~road)
 
-    left, found = without_own_body(aside, trajectory, CONFIG)
+    left, found = without_own_body(aside, trajectory, STATED)
 
     turns = way != "straight"
     assert (on_deck(left).sum() <= 0.02 * deck.sum()) == turns
     assert [body.lidar for body in found] == ["rear"] * turns
+    # Without a stated height it may be a road on a bank.
+    assert without_own_body(aside, trajectory, CONFIG)[1] == ()
+
+
+def test_a_road_above_the_fields_beside_it_stays() -> None:
+    """It turns with the vehicle as well, 1.5 m above what is 3 m and more from the path."""
+    patches = in_yard("eight", deck=False)
+    _, at = EIGHT.poses_at(np.unique(patches.stamps_ns))
+    spinners = lidars(None).values()
+    centres_map, level = _in_map(patches, EIGHT, [s.T_vehicle_lidar for s in spinners])
+    field = level & (cKDTree(at[:, :2]).query(centres_map[:, :2])[0] > 3.0)
+    assert 0.2 < field.sum() / level.sum() < 0.8
+    lowered = np.tile(np.eye(4), (len(field), 1, 1))
+    lowered[field, :3, 3] = -1.5 * patches.normal_lidar[field]
+    moments = lowered @ patches.moments @ lowered.transpose(0, 2, 1)
+    bank = replace(patches, moments=moments)
+    assert np.ptp(_in_map(bank, EIGHT, [s.T_vehicle_lidar for s in spinners])[0][level, 2]) > 1.4
+
+    for config in (CONFIG, STATED):
+        assert without_own_body(bank, EIGHT, config) == (bank, ())
 
 
 def test_guesses_too_rough_to_tell_body_from_ground_leave_it() -> None:

@@ -139,7 +139,7 @@ def test_gnss_figures_of_the_config_leave_the_messages_alone() -> None:
         (10.0, slice(20, 50), (0.1, 0.1, 0.1), 30.0),
         (1.0, slice(20, 80), (0.1, 0.1, 0.1), 20.0),
         (10.0, slice(20, 21), (0.1, 0.1, 0.1), 1.0),  # alone it is as it says
-        (10.0, slice(20, 50), (0.029, 0.029, 0.029), 1.0),
+        (10.0, slice(20, 50), (0.045, 0.045, 0.045), 1.0),  # as with fixed ambiguities
         (10.0, slice(20, 50), (0.01, 0.01, 0.1), 1.0),  # poor in height alone
         (0.05, slice(20, 50), (0.1, 0.1, 0.1), 1.0),  # one in 20 s
     ],

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.common.progress import Progress
+from caliv_graph.config.guesses import configured_guess
 from caliv_graph.config.model import Config
 from caliv_graph.config.range_errors import growth
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
@@ -25,6 +26,7 @@ from caliv_graph.products import (
 from caliv_graph.targets.ground.planes import (
     BENT,
     MIN_SLOPE,
+    GroundPlane,
     fit_plane,
     ground_floors,
     is_passed,
@@ -42,6 +44,10 @@ MAX_APART_NS = 60_000_000
 """Maximum time between a scan and the pose that it is used for. Every LiDAR of 10 Hz has a scan
 within half its period, over which any trajectory is right to 1 mm."""
 
+
+RAISED_M, GUESS_SIGMAS = 0.5, 3.0
+"""A plane that is higher than the stated ground by this, and by so many sigmas of the guess, is
+perhaps the vehicle's roof."""
 
 FEWEST_JUDGED = 8
 """Scans of a LiDAR with ground that is a plane or bent, to say how often it is bent."""
@@ -61,6 +67,7 @@ class GroundMeter:
 
         It is asked for all poses at `stamps_ns` at once: a call for one takes as long.
         """
+        self._config = config
         self._sigma_range_m = config.noise.lidar_range_m
         self._floors = ground_floors(config.noise)
         self._trajectory = trajectory
@@ -107,7 +114,7 @@ class GroundMeter:
         by_guess = deskewed(part, [guess, *rotated], self._trajectory)
         points = next(by_guess)
         plane, reason = fit_plane(points, up_lidar, self._sigma_range_m)
-        if plane is not None and is_passed(plane, scan.points_lidar):
+        if plane is not None and self._is_roof(scan, plane):
             plane, reason = None, "beams pass through the plane, to what is lower"
         if plane is None:
             self._without[scan.lidar][reason] += 1
@@ -141,6 +148,19 @@ class GroundMeter:
             twist_map=turned_twist(R_map_vehicle, twist),
             R_map_vehicle=R_map_vehicle,
         )
+
+    def _is_roof(self, scan: LidarScan, plane: GroundPlane) -> bool:
+        """Whether a plane is far above the stated ground, and beams pass its edges.
+
+        Of a road on a bank or a quay, which beams pass as well, the first does not hold.
+        """
+        height_m = self._config.ground.vehicle_height
+        if height_m is None:
+            return False
+        guess = configured_guess(self._config, scan.lidar)
+        above_m = guess.T_vehicle_lidar.z() + height_m - plane.distance_m
+        doubt_m = GUESS_SIGMAS * float(guess.sigmas[5])
+        return above_m > RAISED_M + doubt_m and is_passed(plane, scan.points_lidar)
 
     def bent(self) -> float:
         """Part of the scans in which the ground is bent, of the LiDAR that finds it so most often.

@@ -13,8 +13,10 @@ import pytest
 
 from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.common.progress import SilentProgress
+from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.load import load_config, parse_config
-from caliv_graph.config.model import Config
+from caliv_graph.config.model import Config, GroundConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.config.range_errors import growth
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import (
@@ -236,12 +238,27 @@ def test_meter_says_why_there_is_no_ground() -> None:
 
 
 def test_the_roof_below_a_lidar_is_no_ground() -> None:
-    meter = GroundMeter(CONFIG, pitching(0.0), 0)
-    roof = plateau(0.3, 4.0, 3.0, HEIGHT_M - 0.2)
+    stated = Config(lidars=CONFIG.lidars, ground=GroundConfig(vehicle_height=0.0))
+    meter = GroundMeter(stated, pitching(0.0), 0)
+    roof = scan_of(level, plateau(0.3, 4.0, 3.0, HEIGHT_M - 0.2), directions=beams(400, 80))
 
     # Beams that clear its edges meet the ground, 2 m below and more than 20 m away.
-    assert meter.measure(scan_of(level, roof, directions=beams(400, 80))) is None
+    assert meter.measure(roof) is None
     assert meter.warnings()[0].endswith("1 beams pass through the plane, to what is lower")
+    # Nothing says that it is not a quay: no height is stated.
+    assert GroundMeter(CONFIG, pitching(0.0), 0).measure(roof) is not None
+
+
+def test_a_road_on_a_bank_is_ground() -> None:
+    """Sixteen metres wide and a metre above the field, at the stated height."""
+    lower = LidarConfig(topic="a", initial=PoseConfig(xyz=(1.0, 0.0, 1.0), rpy_deg=(1.0, 8.0, 0)))
+    config = Config(lidars={"front": lower}, ground=GroundConfig(vehicle_height=0.0))
+    road = scan_of(level, plateau(-30.0, 30.0, 8.0, 1.0), directions=beams(400, 80))
+
+    found = GroundMeter(config, pitching(0.0), 0).measure(road)
+
+    assert found is not None
+    assert found.distance_m == pytest.approx(HEIGHT_M - 1.0, abs=1e-3)
 
 
 def test_ground_with_a_shaft_is_ground() -> None:

@@ -14,6 +14,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, GnssFixes, HeadingSamples, MotionData
+from caliv_graph.trajectory.inputs import check_input
 from caliv_graph.trajectory.physics import motion_physics
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -26,6 +27,7 @@ from tests.trajectory.motions import (
     config_for,
     errors,
     record,
+    rows_of,
     seconds,
     stamps,
 )
@@ -153,3 +155,35 @@ def test_a_second_antenna_needs_its_place() -> None:
     motion = replace(record(ARC, Sensors(), 1), heading=with_second_antenna(1).heading, gnss=None)
     with pytest.raises(TrajectoryError, match=r"topics\.gnss none of the first"):
         smooth_trajectory(motion, settings(), stamps(ARC.duration_s, 5.0))
+
+
+def test_a_baseline_has_the_noise_that_the_fixes_state() -> None:
+    """What rough fixes of two antennas have in common is not in their difference."""
+    motion = with_second_antenna(1)
+    assert motion.gnss is not None
+    rough = seconds(motion.gnss.stamps_ns) > 8.0
+    cov = np.where(rough, 0.15, 0.02)[:, None, None] ** 2 * np.eye(3)
+    motion = replace(motion, gnss=replace(motion.gnss, cov_enu=cov))
+
+    data, _ = check_input(motion, settings(lever_arm=list(SECOND)))
+
+    assert data.positions is not None
+    assert data.positions.shared.max() > 50.0
+    assert data.baselines is not None
+    state = np.sqrt(data.baselines.cov_map[-1, 0, 0])
+    assert state == pytest.approx(math.hypot(0.15, 0.0167), rel=0.05)
+
+
+def test_fixes_are_rough_beside_those_within_the_span_of_the_imu() -> None:
+    motion = without_orientation(1)
+    assert motion.gnss is not None
+    assert motion.imu is not None
+    cov = np.where(seconds(motion.gnss.stamps_ns) > 8.0, 0.15, 0.02)[:, None, None] ** 2
+    late = rows_of(motion.imu, seconds(motion.imu.stamps_ns) > 9.0)
+    motion = replace(motion, imu=late, gnss=replace(motion.gnss, cov_enu=cov * np.eye(3)))
+
+    data, _ = check_input(motion, settings())
+
+    assert data.positions is not None
+    assert (data.positions.shared == 1.0).all()
+    np.testing.assert_allclose(data.positions.cov_map[:, 0, 0], 0.15**2)

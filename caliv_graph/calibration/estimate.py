@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
 from caliv_graph.calibration.drift import about_walls
-from caliv_graph.calibration.given_noise import noise_by_structure
+from caliv_graph.calibration.given_noise import noise_by_structure, residuals_of_structure
 from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.ground_scatter import GroundLevels, larger_levels
@@ -25,6 +25,7 @@ from caliv_graph.calibration.no_target import (
     solution_without_target,
     solve_structure_and_ground,
 )
+from caliv_graph.calibration.noise import PoseResiduals
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.calibration.refine import (
@@ -168,12 +169,14 @@ def _estimate(
         trajectories, grounds, walls = _about_walls(drives, placed, extrinsics, config)
         start = walls.T_vehicle_lidar or placed
         told = structure.slow_errors(trajectories, start, extrinsics, config)
-        told = told if told.T_vehicle_lidar else walls
+        poses, stamps_ns = structure.pose_errors(trajectories, start, config)
+        of_poses = residuals_of_structure(poses, stamps_ns, trajectories, config)
+        told = next((of for of in (told, poses) if of.T_vehicle_lidar), walls)
         noise = estimated_noise(rough.state, rough.registrations, before, told.of_drives)
         trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
         problem = pose_problem(observations, trajectories, config, noise, kept_ns=kept)
     times = {"registration": rough.registration_s, "graph": rough.graph_s}
-    whole = _Whole(problem, trajectories, grounds, structure, noise, kept, config)
+    whole = _Whole(problem, trajectories, grounds, structure, noise, of_poses, kept, config)
     solved = _solved(whole, observations, rough.state, told, times, progress)
     left: tuple[str, ...] = ()
     for _ in range(FURTHER_SOLVES):
@@ -215,6 +218,7 @@ class _Whole:
     grounds: Sequence[GroundObservation]
     structure: StructureEvidence
     noise: SensorNoise
+    of_poses: PoseResiduals | None
     kept: Mapping[int, Sequence[int]]
     config: Config
 
@@ -339,10 +343,12 @@ def _solved(
         problem = pose_problem(observations, trajectories, config, noise, others, whole.kept)
         problem = replace(problem, moved_with=extrinsics)
         solve, offsets_s = solved_with_structure(
-            problem, registrations, grounds, config, found, terms, extrinsics
+            problem, registrations, grounds, config, found, terms, extrinsics, whole.of_poses
         )
     else:
-        solve = solve_registered(problem, registrations, grounds, config, found)
+        solve = solve_registered(
+            problem, registrations, grounds, config, found, of_poses=whole.of_poses
+        )
     if has_clock(problem):
         reduced = reduced_registered(solve, registrations)
         solve = under_clock_prior(solve, reduced, None)

@@ -1,4 +1,4 @@
-"""Noise of given poses where no target is: from what structure says of them.
+"""Noise of given poses from what structure says of them, with a target and without.
 
 Walls that wander as the poses do tell white and slow errors of these (`README.md`, "Noise levels").
 """
@@ -10,7 +10,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import scipy.linalg
 
-from caliv_graph.calibration.noise import KNOWN_PART, expected_noise, first_pose_noise
+from caliv_graph.calibration.noise import (
+    KNOWN_PART,
+    PoseResiduals,
+    expected_noise,
+    first_pose_noise,
+)
 from caliv_graph.calibration.structure_evidence import ToldErrors
 from caliv_graph.calibration.variance_components import Observed
 from caliv_graph.calibration.vehicle_parameters import pose_clock_prior
@@ -28,6 +33,31 @@ def noise_by_structure(
 ) -> PoseNoise:
     """White and slow errors of the given poses of all drives, where structure tells them.
 
+    The arguments are those of `residuals_of_structure`.
+    """
+    walls = residuals_of_structure(told, stamps_ns, trajectories, config)
+    if walls is None:
+        return first_pose_noise(config.noise)
+    of_messages = np.concatenate(
+        [_stated(trajectories[drive], stamps_ns[drive], config) for drive in told.of_drives]
+    )
+    every = bool(of_messages.any(axis=(1, 2)).all())
+    return expected_noise(
+        [walls],
+        config.noise,
+        open_levels=(not every, True),
+        of_messages=of_messages if every else None,
+    )
+
+
+def residuals_of_structure(
+    told: ToldErrors,
+    stamps_ns: Mapping[int, IntArray],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+) -> PoseResiduals | None:
+    """What structure says of the given poses of all drives; None: nothing.
+
     With information S and gradient h of a drive's structure on its poses, extrinsics and surfaces
     eliminated, `W = S^1/2` and the poses' errors e with effect B, `W^-1 h = W B e + n`, n white of
     unit variance: the noise of e is a sum of variance components of these residuals.
@@ -39,7 +69,7 @@ def noise_by_structure(
         config: what it states is kept.
     """
     if not told.of_drives:
-        return first_pose_noise(config.noise)
+        return None
     residuals, late, effects, known, times, stated = [], [], [], [], [], []
     for drive, (information, gradient) in told.of_drives.items():
         trajectory, stamps = trajectories[drive], stamps_ns[drive]
@@ -55,8 +85,7 @@ def noise_by_structure(
         R, _ = trajectory.poses_at(stamps)
         effect[..., 3:] = np.einsum("nki,kji->nkj", effect[..., 3:], R)
         effects.append(effect)
-        cov = given_pose_covariances(trajectory.error_covariances(stamps), config)
-        of_message = np.zeros((len(stamps), 6, 6)) if cov is None else np.nan_to_num(cov)
+        of_message = _stated(trajectory, stamps, config)
         stated.append(of_message)
         known.append(np.eye(len(white)) + np.einsum("nki,kij,mkj->nm", effect, of_message, effect))
         times.append(1e-9 * (stamps - stamps[0]))
@@ -84,12 +113,11 @@ def noise_by_structure(
 
     by_message = [of.any(axis=(1, 2)) for of in stated]
     white_parts = of_drives([np.diag(np.where(of, 0.0, 1.0)) for of in by_message])
-    every = bool(np.concatenate(by_message).all())
-    return expected_noise(
-        observed,
-        white_parts,
-        slow,
-        config.noise,
-        open_levels=(not every, True),
-        of_messages=np.concatenate(stated) if every else None,
-    )
+    return PoseResiduals(observed, white_parts, slow)
+
+
+def _stated(trajectory: VehicleTrajectory, stamps_ns: IntArray, config: Config) -> Array:
+    """(n, 6, 6) white errors that messages state for given poses; zero where none does."""
+    assert isinstance(trajectory, GivenTrajectory)
+    cov = given_pose_covariances(trajectory.error_covariances(stamps_ns), config)
+    return np.zeros((len(stamps_ns), 6, 6)) if cov is None else np.nan_to_num(cov)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, replace
+from dataclasses import astuple, dataclass, replace
 
 import gtsam
 import numpy as np
@@ -36,6 +36,7 @@ from caliv_graph.calibration.variance_components import (
     Unknown,
     maximise_exactly,
     time_of_expected,
+    together,
 )
 from caliv_graph.calibration.vehicle_parameters import KEYS, POSE_TIME_OFFSET
 from caliv_graph.config.noise import NoiseConfig
@@ -134,6 +135,29 @@ def sound_clouds(
     return np.asarray(squared < GROSS * np.median(squared))
 
 
+@dataclass(frozen=True)
+class PoseResiduals:
+    """Residuals that errors of given poses move.
+
+    Attributes:
+        observed: the residuals.
+        white: their covariances (N, N) by white errors, rotation and position, at sigma 1.
+        slow: the same of Gauss-Markov errors, by their correlation time in seconds.
+        clouds: registrations of clouds among the residuals.
+    """
+
+    observed: Observed
+    white: tuple[Array, Array]
+    slow: Callable[[float], tuple[Array, Array]]
+    clouds: Sequence[Block] = ()
+
+    def likelihood(self, time_s: float, clouds: Sequence[Component]) -> Likelihood:
+        """At a correlation time; the unknowns 0 to 3 are the sigmas of `PoseNoise`, in order."""
+        parts = enumerate((*self.white, *self.slow(time_s)))
+        errors = [Component(part, (number,)) for number, part in parts]
+        return Likelihood(self.observed, [*errors, *clouds])
+
+
 def fit_pose_noise(
     problem: Problem,
     measured: Sequence[gtsam.Pose3],
@@ -141,6 +165,7 @@ def fit_pose_noise(
     sound: BoolArray,
     values: gtsam.Values,
     config: NoiseConfig,
+    of_poses: PoseResiduals | None = None,
 ) -> tuple[PoseNoise, float]:
     """Variances of the given poses and the scale of the registration's sigmas.
 
@@ -156,6 +181,7 @@ def fit_pose_noise(
         values: the current extrinsics and targets, and the poses *as given*: estimated poses
             have taken up the errors that are to be measured.
         config: what is given there is kept.
+        of_poses: what structure says of them; None: nothing.
     """
     chosen = evenly_over_drives(problem, sound)
     r, A, B = _stacked(problem, linearise_clouds(problem, values), measured, values, chosen)
@@ -170,11 +196,8 @@ def fit_pose_noise(
     if problem.stated_cov is not None and stated.any() and not (given & ~stated).any():
         of_messages = problem.stated_cov[stated]
     noise = expected_noise(
-        observed,
-        white,
-        slow,
+        [PoseResiduals(observed, white, slow, clouds), *([] if of_poses is None else [of_poses])],
         config,
-        clouds=clouds,
         open_levels=(bool((given & ~stated).any()), bool(given.any())),
         of_messages=of_messages,
     )
@@ -189,12 +212,9 @@ def fit_pose_noise(
 
 
 def expected_noise(
-    observed: Observed,
-    white: tuple[Array, Array],
-    slow: Callable[[float], tuple[Array, Array]],
+    evidence: Sequence[PoseResiduals],
     config: NoiseConfig,
     *,
-    clouds: Sequence[Block] = (),
     open_levels: tuple[bool, bool] = (True, True),
     of_messages: Array | None = None,
 ) -> PoseNoise:
@@ -205,11 +225,9 @@ def expected_noise(
     by at least as much as these hypotheses together (Jensen).
 
     Args:
-        observed: the residuals.
-        white: their covariances (N, N) by white errors, rotation and position, at sigma 1.
-        slow: the same of Gauss-Markov errors of a correlation time in seconds.
+        evidence: the residuals. Those of clouds and of structure count as independent of each
+            other, though the same errors move both.
         config: what is stated there is kept.
-        clouds: registrations of clouds among the residuals.
         open_levels: whether white and whether Gauss-Markov sigmas are to be found; else `TYPICAL`.
         of_messages: (n, 6, 6) white errors of all poses, if messages state them.
     """
@@ -221,20 +239,24 @@ def expected_noise(
         kept = median if value is None else value
         free = need and value is None
         unknowns.append(Unknown(kept, LOG_SPREAD, (low, high) if free else (kept, kept)))
-    scale = len(unknowns)
-    unknowns += [SCALE, *([CLOUD] * len(clouds))]
-    of_clouds = [Component(of, (scale, scale + 1 + row)) for row, of in enumerate(clouds)]
+    levels, of_clouds = len(unknowns), list[list[Component]]()
+    for of in evidence:
+        scale = len(unknowns)
+        numbered = enumerate(of.clouds, start=scale + 1)
+        of_clouds.append([Component(block, (scale, number)) for number, block in numbered])
+        unknowns += [SCALE, *([CLOUD] * len(of.clouds))]
     time_s = config.pose_drift_time_s or TYPICAL.drift_time_s
     given_time = config.pose_drift_time_s is not None or not open_levels[1]
     times_s = np.array([time_s] if given_time else TIMES_S)
     found, costs = np.array([u.median for u in unknowns]), np.zeros(len(times_s))
-    variances = np.zeros((len(times_s), scale))
+    variances = np.zeros((len(times_s), levels))
     for row, time in enumerate(times_s.tolist()):
-        parts = [Component(part, (number,)) for number, part in enumerate((*white, *slow(time)))]
-        likelihood = Likelihood(observed, [*parts, *of_clouds])
-        found, cost = maximise_exactly(likelihood.cost, unknowns, found)
+        likelihoods = [
+            of.likelihood(time, more) for of, more in zip(evidence, of_clouds, strict=True)
+        ]
+        found, cost = maximise_exactly(together(likelihoods), unknowns, found)
         surprise = math.log(time / TYPICAL.drift_time_s) / TIME_SPREAD
-        costs[row], variances[row] = cost + 0.5 * surprise**2, found[:scale] ** 2
+        costs[row], variances[row] = cost + 0.5 * surprise**2, found[:levels] ** 2
     weight = np.exp(costs.min() - costs)
     weight /= weight.sum()
     expected = weight @ variances

@@ -85,7 +85,7 @@ def _snoop(state: SolveState, registrations: Sequence[Registration]) -> None:
         else:
             given = with_given_poses(problem, state.values)
             state.noise, state.scale = fit_pose_noise(
-                problem, measured, single, by, given, state.config.noise
+                problem, measured, single, by, given, state.config.noise, state.of_poses
             )
         # Clouds that are a metre off bend the values so much that all others seem to be off.
         state.weights.values = np.where(by, whole, MIN_WEIGHT)

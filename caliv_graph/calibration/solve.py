@@ -37,6 +37,7 @@ from caliv_graph.calibration.ground_weights import ground_weights
 from caliv_graph.calibration.linear import CloudLinearisation, linearise_clouds
 from caliv_graph.calibration.noise import (
     TYPICAL_SCALE,
+    PoseResiduals,
     first_pose_noise,
     fit_pose_noise,
     sound_clouds,
@@ -110,6 +111,8 @@ class SolveState:
     structure: tuple[StructureTerm, ...] = ()
     structure_factors: CalibrationGraph = field(default_factory=CalibrationGraph)
     """Of `structure`; like those of `motion` they take time to build."""
+    of_poses: PoseResiduals | None = None
+    """What structure says of the noise of given poses."""
 
 
 def solve_registered(
@@ -120,11 +123,13 @@ def solve_registered(
     turns: tuple[Symmetry | None, ...] = (),
     structure: tuple[StructureTerm, ...] = (),
     start: Mapping[str, gtsam.Pose3] | None = None,
+    of_poses: PoseResiduals | None = None,
 ) -> SolveState:
     """The paper's minimisation on the graph: pose factors, robust, noise levels from the data.
 
     `registrations` are of the problem's placements, in order; `turns` the continuous symmetry of
-    each placement's target, empty for none; `start` extrinsics that are nearer than the guesses.
+    each placement's target, empty for none; `start` extrinsics that are nearer than the guesses;
+    `of_poses` what structure says of the noise of given poses.
 
     Raises:
         SolveError: the graph is singular.
@@ -146,6 +151,7 @@ def solve_registered(
         structure_factors=structure_graph(
             problem, structure, start, drives_with_planes(problem, grounds, config.ground)
         ),
+        of_poses=of_poses,
     )
     state.values.insert(ground_values(problem, grounds, state.values, config.ground))
     # Before the noise is known, weights would treat the Gauss-Markov pose error as outliers, and
@@ -158,7 +164,7 @@ def solve_registered(
     single = of_single_clouds(information, registrations)
     state.sound = sound_clouds(problem, measured, single, given, state.noise) & (explained > 0.5)
     state.noise, state.scale = fit_pose_noise(
-        problem, measured, single, state.sound, given, config.noise
+        problem, measured, single, state.sound, given, config.noise, of_poses
     )
     state.weights = robust
     rounds = REWEIGHTINGS * state.weights.kernel.patience

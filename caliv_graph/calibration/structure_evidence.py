@@ -10,6 +10,7 @@ from functools import partial
 import gtsam
 import numpy as np
 
+from caliv_graph.calibration.noise import PoseResiduals
 from caliv_graph.calibration.pose_priors import given_prior, plain_prior, pose_priors
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M, Problem
 from caliv_graph.calibration.solve import SolveState, offset_sigmas, solve_registered
@@ -403,13 +404,15 @@ def solved_with_structure(
     turns: tuple[Symmetry | None, ...],
     terms: tuple[StructureTerm, ...],
     rough: Mapping[str, gtsam.Pose3],
+    of_poses: PoseResiduals | None = None,
 ) -> tuple[SolveState, dict[str, float]]:
     """`solve_registered` with structure; and LiDAR -> 1 sigma in seconds of each time offset.
 
-    `rough` are extrinsics of the LiDARs that saw the target.
+    `rough` are extrinsics of the LiDARs that saw the target, `of_poses` what structure says of the
+    noise of given poses.
     """
     start = nearest_extrinsics(rough, terms)
-    solve = solve_registered(problem, registrations, grounds, config, turns, terms, start)
+    solve = solve_registered(problem, registrations, grounds, config, turns, terms, start, of_poses)
     return solve, offset_sigmas(solve, registrations)
 
 

@@ -193,6 +193,20 @@ class Likelihood:
         return out
 
 
+Cost = Callable[[Array], tuple[float, Array, Array]]
+"""Minus a log-likelihood at logarithms (k,) of unknowns, with slope and information."""
+
+
+def together(likelihoods: Sequence[Likelihood]) -> Cost:
+    """Of residuals that are independent of each other and have the same unknowns."""
+
+    def cost(x: Array) -> tuple[float, Array, Array]:
+        values, slopes, informations = zip(*(of.cost(x) for of in likelihoods), strict=True)
+        return sum(values), np.sum(slopes, axis=0), np.sum(informations, axis=0)
+
+    return cost
+
+
 @dataclass(frozen=True)
 class Unknown:
     """A positive quantity to estimate: its log-normal prior and its bounds.
@@ -215,10 +229,6 @@ def time_of_expected(variances: Array, times_s: Array) -> float:
     (Jensen). `variances` (..., n) are the expected ones by each of their times (n,).
     """
     return float(variances.sum() / (variances / times_s).sum())
-
-
-Cost = Callable[[Array], tuple[float, Array, Array]]
-"""Minus a log-likelihood at logarithms (k,) of unknowns, with slope and information."""
 
 
 def maximise(cost: Cost, unknowns: Sequence[Unknown], start: Array) -> tuple[Array, float]:

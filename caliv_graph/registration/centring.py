@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from caliv_graph.products import Array, Side
+from caliv_graph.products import Array, BoolArray, Side
 from caliv_graph.registration.clouds import CloudStack
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -23,50 +24,80 @@ LEAST_WIDE_M = 0.05
 """Smallest width and height of the volume that outliers are spread over."""
 
 
-def centre_clouds(
-    clouds: CloudStack, R: Array, t: Array, cut: Sequence[frozenset[Side]] = ()
-) -> Array:
-    """(J, 3) translations that put the middle of every cloud's extent at the origin.
+MIDDLE = 0.05
+"""1 sigma of the middle of a whole extent, as a part of it: where beams fell."""
 
-    An initial guess displaces the target by up to 1 m (3 degrees at 20 m). All clouds of a target
-    have about the same extent, whatever the density of their points. Where the edge of the field of
-    view cuts a cloud off (`cut`, of each cloud; empty: of none), its middle is half the median
-    extent of the others away from the side that is whole.
+LACKING = 0.5
+"""1 sigma of a middle, as a part of what its cloud lacks of the median extent: a hidden side."""
+
+
+@dataclass(frozen=True)
+class Middles:
+    """Middles of the extents of clouds.
+
+    Attributes:
+        points: (J, 3) metres, each in the frame of its LiDAR.
+        axes: (J, 3, 3) rows ahead, left and up of each view, axes of the map.
+        sigmas_m: (J, 3) 1 sigma along these, as middles of the target.
+    """
+
+    points: Array
+    axes: Array
+    sigmas_m: Array
+
+
+def middles_of(
+    clouds: CloudStack, R: Array, t: Array, cut: Sequence[frozenset[Side]] = ()
+) -> Middles:
+    """The middle of every cloud's extent.
+
+    All clouds of a target have about the same extent, whatever the density of their points. Where
+    the edge of the field of view cuts a cloud off (`cut`, of each cloud; empty: of none), its
+    middle is half the median extent of the others away from the side that is whole.
+
+    Args:
+        clouds: the clouds.
+        R: (J, 3, 3) rotations map from lidar.
+        t: (J, 3) metres.
+        cut: sides of each cloud.
     """
     points = clouds.moved(R, t)
     beams = clouds.rotated(R, clouds.beams)
-    out = t.copy()
     ends = np.append(clouds.starts, len(points))
     sides = cut or [frozenset()] * clouds.count
-    # Per cloud, at right angles to the view and upwards: direction, low, high, which ends are cut.
-    spans = []
+    axes, low, high = np.empty((clouds.count, 3, 3)), np.empty_like(t), np.empty_like(t)
+    # Of each cloud: right and left, bottom and top.
+    off = np.zeros((clouds.count, 2, 2), dtype=bool)
     for j, own_sides in enumerate(sides):
         own = slice(ends[j], ends[j + 1])
         # Axes of the view, not of the map: its placing shall not matter.
-        axes = _axes_of_view(beams[own].mean(axis=0))
-        low, high = np.percentile(points[own] @ axes.T, [2, 98], axis=0)
-        out[j] -= 0.5 * (low + high) @ axes
-        cut_ends = _cut_ends(own_sides, R[j], axes)
-        spans.append(
-            (
-                (axes[1], (low[1], high[1]), cut_ends[0]),
-                (UP, (low[2], high[2]), cut_ends[1]),
-            )
-        )
+        axes[j] = _axes_of_view(beams[own].mean(axis=0))
+        low[j], high[j] = np.percentile(points[own] @ axes[j].T, [2, 98], axis=0)
+        off[j] = _cut_ends(own_sides, R[j], axes[j])
+    middle, extent = 0.5 * (low + high), (high - low)[:, 1:]
+    typical = np.empty(2)
     for axis in (0, 1):
-        whole = [np.ptp(span[axis][1]) for span in spans if not any(span[axis][2])]
-        typical = float(np.median(whole or [max(np.ptp(span[axis][1]) for span in spans)]))
-        for j, span in enumerate(spans):
-            direction, (low, high), (cut_low, cut_high) = span[axis]
-            lacks = max(typical - (high - low), 0.0)
-            out[j] += 0.5 * lacks * (float(cut_low) - float(cut_high)) * direction
-    return out
+        whole = extent[~off[:, axis].any(axis=1), axis]
+        typical[axis] = np.median(whole) if len(whole) else extent[:, axis].max()
+    lacks = np.maximum(typical - extent, 0.0)
+    middle[:, 1:] -= 0.5 * lacks * (off[..., 0].astype(float) - off[..., 1])
+    # Along the view a target is taken to be as deep as it is wide.
+    deep, whole_m = (high - low)[:, :1], typical[[0, 0, 1]]
+    lacks = np.hstack([np.maximum(typical[0] - deep, 0.0), lacks])
+    sigmas_m = MIDDLE * np.maximum(whole_m, LEAST_WIDE_M) + LACKING * lacks
+    in_map = np.einsum("jba,jb->ja", axes, middle) - t
+    return Middles(np.einsum("jba,jb->ja", R, in_map), axes, sigmas_m)
 
 
-def _cut_ends(
-    sides: frozenset[Side], R_target_lidar: Array, axes: Array
-) -> tuple[tuple[bool, bool], tuple[bool, bool]]:
-    """Which ends are cut, (right, left) and (bottom, top), in the level axes of a view (3, 3).
+def centre_clouds(
+    clouds: CloudStack, R: Array, t: Array, cut: Sequence[frozenset[Side]] = ()
+) -> Array:
+    """(J, 3) translations that put the middle of every cloud's extent at the origin."""
+    return -np.asarray(np.einsum("jab,jb->ja", R, middles_of(clouds, R, t, cut).points))
+
+
+def _cut_ends(sides: frozenset[Side], R_target_lidar: Array, axes: Array) -> BoolArray:
+    """(2, 2) which ends are cut, right and left, bottom and top, in the axes of a view (3, 3).
 
     `sides` are the LiDAR's own: upside down its top is below, on its side it is left or right. A
     side that is nearer to none of the axes counts for none.
@@ -81,8 +112,7 @@ def _cut_ends(
         which = int(np.abs(along).argmax())
         if np.abs(along[which]) > NEAREST_AXIS * np.linalg.norm(direction):
             cut[which, int(along[which] > 0.0)] = True
-    (right, left_end), (bottom, top_end) = cut.tolist()
-    return (right, left_end), (bottom, top_end)
+    return cut
 
 
 def _axes_of_view(view: Array) -> Array:

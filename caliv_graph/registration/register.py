@@ -17,15 +17,17 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, Mixture, Registration, TargetObservation
-from caliv_graph.registration.centring import centre_clouds, depth_of
+from caliv_graph.registration.centring import depth_of, middles_of
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
 from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import expect, maximise_shape, seed_mixture
 from caliv_graph.registration.moments import Responsibilities, cell_moments
+from caliv_graph.registration.placing import placed_by_motion
 from caliv_graph.registration.quadratic import ShapeQuadratic, shape_quadratic
 from caliv_graph.registration.starts import best_starts, suspicious
 from caliv_graph.targets.cloud.views import TYPICAL_SHARED, weights_of_views
@@ -153,6 +155,7 @@ class JointRegistration:
         )
         self._components = config.registration.components // (2 if rough else 1)
         self._gamma = config.registration.outlier_ratio
+        self._guess_sigmas = {name: of.sigma.sigmas() for name, of in config.lidars.items()}
         self.tolerance = ROUGH_TOLERANCE if rough else STEP_TOLERANCE
         self._floor_end = FLOOR_PER_RANGE_SIGMA * config.noise.lidar_range_m
         self._floor = COARSE_SIGMA_M
@@ -203,6 +206,21 @@ class JointRegistration:
         if self._near is not None:
             part._near = self._near[self.clouds.points_of(which)]
         return part
+
+    def placed(self, R: Array, t: Array) -> Array:
+        """(J, 3) where the clouds begin, metres: the target's centre is the origin.
+
+        Args:
+            R: (J, 3, 3) rotations map from lidar, of the prealigned clouds.
+            t: (J, 3) metres.
+        """
+        clouds = self.observation.clouds
+        middles = middles_of(self.clouds, R, t, [cloud.cut for cloud in clouds])
+        names = list(dict.fromkeys(cloud.lidar for cloud in clouds))
+        sigmas = np.array([self._guess_sigmas.get(name, DEFAULT_GUESS_SIGMAS) for name in names])
+        largest = sigmas.reshape(-1, 2, 3).max(axis=2)
+        apart = placed_by_motion(middles, R, t, self.clouds.lidar, largest)
+        return np.asarray(apart - np.einsum("jab,jb->ja", R, middles.points))
 
     def seed(self, R: Array, t: Array, sigma_m: float, draw: int = 0) -> None:
         """Begins a new mixture of width `sigma_m` (metres) at `T_target_lidar` (R, t).
@@ -372,7 +390,7 @@ def register_jointly(
     """
     R, t = stack(list(T_target_lidar))
     if coarse:
-        t = centre_clouds(state.clouds, R, t, [c.cut for c in state.observation.clouds])
+        t = state.placed(R, t)
     state.seed(R, t, COARSE_SIGMA_M if coarse else FINE_SIGMA_M)
     if coarse and other_starts:
         run = _from_other_starts(state, R, t, max_iterations)

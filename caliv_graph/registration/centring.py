@@ -27,8 +27,9 @@ LEAST_WIDE_M = 0.05
 MIDDLE = 0.05
 """1 sigma of the middle of a whole extent, as a part of it: where beams fell."""
 
-LACKING = 0.5
-"""1 sigma of a middle, as a part of what its cloud lacks of the median extent: a hidden side."""
+LACKING, NARROW = 0.5, 0.1
+"""1 sigma of a middle, as a part of what its cloud lacks of the median extent: in depth, or where
+the field of view cuts it off; and across the view, where a target may be narrower from there."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,9 @@ def middles_of(
     middle[:, 1:] -= 0.5 * lacks * (off[..., 0].astype(float) - off[..., 1])
     # Along the view a target is taken to be as deep as it is wide.
     deep, whole_m = (high - low)[:, :1], typical[[0, 0, 1]]
-    lacks = np.hstack([np.maximum(typical[0] - deep, 0.0), lacks])
-    sigmas_m = MIDDLE * np.maximum(whole_m, LEAST_WIDE_M) + LACKING * lacks
+    unseen = LACKING * np.maximum(typical[0] - deep, 0.0)
+    unseen = np.hstack([unseen, np.where(off.any(axis=2), LACKING, NARROW) * lacks])
+    sigmas_m = MIDDLE * np.maximum(whole_m, LEAST_WIDE_M) + unseen
     in_map = np.einsum("jba,jb->ja", axes, middle) - t
     return Middles(np.einsum("jba,jb->ja", R, in_map), axes, sigmas_m)
 

@@ -19,8 +19,9 @@ LEAST_MOTION_M = 0.03
 """1 sigma of a place by the motion, at least: half of what the registration draws a cloud in
 from."""
 
-MOST_MOTION_M = 10.0
-"""And at most: then the middles alone say where the clouds begin."""
+MOST_MOTION_M = 0.1
+"""And at most: where it errs by more, it is no nearer than the middles, which the registration of
+a compact target always starts well from."""
 
 DISTINCT = 10.0
 """All clouds of a LiDAR together count as so many at most: neighbouring views err alike."""
@@ -42,8 +43,8 @@ def placed_by_motion(
 
     Least squares: the centre, and an error of each LiDAR's guess, by which all middles are in the
     centre. What is left of them is where the motion has each. They keep that as far as it is known
-    better than the middle is: if middles scatter across the view by more than their sigmas, the
-    motion is not.
+    better than the middle is: what middles scatter across the view by more than their sigmas is an
+    error of the motion. Where that is more than `MOST_MOTION_M`, all middles are in the centre.
 
     Args:
         middles: of the clouds.
@@ -86,13 +87,18 @@ def placed_by_motion(
     points = np.einsum("jab,jb->ja", now_R, middles.points) + now_t
     left = np.einsum("jab,jb->ja", middles.axes, points - centre)
     motion = _excess(left[:, 1:], middles.sigmas_m[:, 1:])
+    if motion is None:
+        return np.zeros_like(t)
     kept = middles.sigmas_m**2 / (middles.sigmas_m**2 + motion)
     return np.asarray(np.einsum("jba,jb->ja", middles.axes, kept * left))
 
 
-def _excess(residuals: Array, sigmas: Array) -> float:
-    """Variance of the motion, square metres: what residuals scatter more than by their sigmas."""
-    variances = np.square(np.geomspace(LEAST_MOTION_M, MOST_MOTION_M, 30))
+def _excess(residuals: Array, sigmas: Array) -> float | None:
+    """Variance of the motion, square metres: what residuals scatter more than by their sigmas.
+
+    None: more than that of `MOST_MOTION_M`.
+    """
+    variances = np.square(np.geomspace(LEAST_MOTION_M, MOST_MOTION_M, 10))
     over = np.abs(residuals).ravel() / np.sqrt(sigmas.ravel() ** 2 + variances[:, None])
     fits = np.median(over, axis=1) < 1.0 / MAD
-    return float(variances[int(fits.argmax())] if fits.any() else variances[-1])
+    return float(variances[int(fits.argmax())]) if fits.any() else None

@@ -19,7 +19,7 @@ from caliv_graph.structure.heavy_tails import FREEDOM, heavy_tailed
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
-from caliv_graph.structure.sightings import Sightings
+from caliv_graph.structure.sightings import BEAM_RAD, MIN_COS, ROUGHNESS_M, Sightings
 from caliv_graph.structure.tilts import first_tilts_per_m, fitted_tilts
 from caliv_graph.structure.views import Views
 
@@ -94,10 +94,26 @@ def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
     0.16 mrad off at a claimed 0.05). What is stated where there are too few patches.
     """
     out = np.full(len(patches.lidars), stated_m)
-    for i, found in enumerate(_scatter_parts(patches, np.ones(len(patches.scan), dtype=bool))):
-        if found is not None:
+    every = np.ones(len(patches.scan), dtype=bool)
+    for i, found in enumerate(_scatter_parts(patches, every)):
+        if found is None:
+            own = every & (patches.scan_lidar[patches.scan] == i)
+            out[i] = _range_sigma_of_few(patches, own, stated_m)
+        else:
             out[i] = math.sqrt(max(float(found[0]), LEAST_RANGE_M**2))
     return out
+
+
+def _range_sigma_of_few(patches: DrivePatches, own: BoolArray, stated_m: float) -> float:
+    """Noise along the beam by too few patches to tell it from all else, which is as usual.
+
+    What is stated counts as `LEAST_PATCHES` of them.
+    """
+    cos, distance, variance = _scatter_of(patches, own & (patches.points >= LEAST_POINTS))
+    across = (BEAM_RAD * distance) ** 2 * (1.0 - cos**2) + ROUGHNESS_M**2
+    along = (variance - across) / np.maximum(cos, MIN_COS) ** 2
+    both = np.append(along, np.full(LEAST_PATCHES, stated_m**2))
+    return math.sqrt(max(float(np.median(both)), LEAST_RANGE_M**2))
 
 
 def roughness_m(patches: DrivePatches, of: BoolArray) -> Array:
@@ -112,12 +128,7 @@ def _scatter_parts(patches: DrivePatches, of: BoolArray) -> list[Array | None]:
     The variance of a patch is `sigma_r^2 cos^2 + (d sigma_b)^2 sin^2 + roughness^2`, d the
     distance. Medians of classes, as patches of leaves scatter more.
     """
-    centres = patches.centres_lidar
-    distance = np.linalg.norm(centres, axis=1)
-    cos = np.abs(np.einsum("ni,ni->n", centres, patches.normal_lidar)) / distance
-    free = np.maximum(patches.points - 3.0, 1.0)
-    # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
-    variance = patches.scatter_m**2 / (1.0 - 2.0 / (9.0 * free)) ** 3
+    cos, distance, variance = _scatter_of(patches, np.ones(len(patches.scan), dtype=bool))
     of = of & (patches.points >= LEAST_POINTS)
     out: list[Array | None] = []
     for i in range(len(patches.lidars)):
@@ -132,6 +143,16 @@ def _scatter_parts(patches: DrivePatches, of: BoolArray) -> list[Array | None]:
         ]
         out.append(_variance_parts(*np.array(medians).T))
     return out
+
+
+def _scatter_of(patches: DrivePatches, of: BoolArray) -> tuple[Array, Array, Array]:
+    """Cosine of the incidence, distance and scatter (n,) of some patches (N,); the last in m^2."""
+    centres = patches.centres_lidar[of]
+    distance = np.linalg.norm(centres, axis=1)
+    cos = np.abs(np.einsum("ni,ni->n", centres, patches.normal_lidar[of])) / distance
+    free = np.maximum(patches.points[of] - 3.0, 1.0)
+    # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
+    return cos, distance, patches.scatter_m[of] ** 2 / (1.0 - 2.0 / (9.0 * free)) ** 3
 
 
 def _variance_parts(cos: Array, distance_m: Array, variance: Array) -> Array:

@@ -233,7 +233,9 @@ def shape_quadratic(
     torque += known[:, None] * towards
     C += (known + seen)[:, None, None] * np.eye(3)
     # The normals of the points and the beams turn with their clouds: so do the priors.
-    parts_of_weight = points[..., 0] / mass
+    # They add up to one also of a surfel with hardly a point: else a turn of all clouds together,
+    # which the points say nothing of, would not be free.
+    parts_of_weight = points[..., 0] / np.maximum(total[:, 0], 1e-300)
     by_normals = known * parts_of_normal
     turning[..., 10] = by_normals + seen * parts_of_weight
     coupling = [_coupling(W, surface_means)]

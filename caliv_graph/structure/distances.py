@@ -136,7 +136,8 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
         tilt_times=levels.tilt_times,
         bend=np.where(strips.level, *levels.bend_per_m),
     )
-    weights = robust_weights(own, sightings, nuisances)
+    sigma_m = nuisances.offsets(sightings.strip, lidar, strips.level)
+    weights = robust_weights(own, sightings, sigma_m, shared)
     scans = np.zeros((strips.count, layout.lidars), dtype=np.int64)
     np.add.at(scans, (sightings.strip, lidar), weights > 0.0)
     enough = scans >= OWN_SIGHTINGS
@@ -326,9 +327,9 @@ def _measured(
     repeated = problem.views.count[sightings.scan]
     same = alike(problem, sightings)
     lidar = problem.patches.scan_lidar[sightings.scan]
-    tilts = other.nuisances.tilts(sightings.strip, lidar, strips.level)
+    own = other.nuisances.errors(sightings.strip, lidar, strips.level)
     rows = whitened(
-        geometry, sightings, group, repeated, same, tilts, other.nuisances, weights, layout
+        geometry, sightings, group, repeated, same, own, other.nuisances, weights, layout
     )
     found = _Distances(other, rows)
     offsets, by_plane = geometry.offsets_m(sightings), geometry.plane_rows(sightings)

@@ -33,6 +33,8 @@ class Nuisances:
         sighting_tilt: (K,) tilt of each strip from scan to scan, rad; not metres.
         strip_tilt: (K,) tilt that a LiDAR sees each strip have in all scans against what others
             see, rad; not metres.
+        lidar_offsets: (L, 2) what a LiDAR adds to `sighting`, on level strips and on others, more
+            than the others do: noise that is more than it seems; empty: nothing.
         tilt_times: (L, 2) how much larger both tilts are of each LiDAR, on level strips and on
             others; empty: of none.
         shared: offset of a surface from scan to scan, which its strips share: incidence, and how
@@ -62,6 +64,23 @@ class Nuisances:
     jitter_s: float = 0.0
     turn_rad_s: Array = field(default_factory=lambda: np.zeros((0, 3)))
     tilt_times: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    lidar_offsets: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def of_lidar(self, strip: IntArray, lidar: IntArray, level: BoolArray) -> Array:
+        """(n,) `lidar_offsets` on strips (n,) of LiDARs (n,); `level` (K,) as in `tilts`."""
+        if not len(self.lidar_offsets):
+            return np.zeros(len(strip))
+        return self.lidar_offsets[lidar, np.where(level[strip], 0, 1)]
+
+    def offsets(self, strip: IntArray, lidar: IntArray, level: BoolArray) -> Array:
+        """(n,) offset of strips (n,) from scan to scan as LiDARs (n,) see them."""
+        return np.hypot(self.sighting[strip], self.of_lidar(strip, lidar, level))
+
+    def errors(
+        self, strip: IntArray, lidar: IntArray, level: BoolArray
+    ) -> tuple[Array, Array, Array]:
+        """`offsets` and both `tilts`."""
+        return self.offsets(strip, lidar, level), *self.tilts(strip, lidar, level)
 
     def tilts(self, strip: IntArray, lidar: IntArray, level: BoolArray) -> tuple[Array, Array]:
         """(n,) `sighting_tilt` and `strip_tilt` of strips (n,) as LiDARs (n,) see them.

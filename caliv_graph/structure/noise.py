@@ -19,7 +19,7 @@ from caliv_graph.structure.heavy_tails import FREEDOM, heavy_tailed
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
-from caliv_graph.structure.sightings import BEAM_RAD, MIN_COS, ROUGHNESS_M, Sightings
+from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.tilts import first_tilts_per_m, fitted_tilts
 from caliv_graph.structure.views import Views
 
@@ -78,6 +78,9 @@ LEAST_JITTER_S = 1e-5
 MOST_JITTER_S = 0.02
 """1 sigma of the jitter of stamps: 20 um at 2 m/s, and a fifth of a revolution."""
 
+LEAST_SIGHTINGS = 20
+"""Sightings of a LiDAR that tell how much more its offsets err than those of all, at least."""
+
 PROBES = 20
 """Random vectors for the trace: it is then good to a few percent."""
 
@@ -94,26 +97,10 @@ def range_sigmas(patches: DrivePatches, stated_m: float) -> Array:
     0.16 mrad off at a claimed 0.05). What is stated where there are too few patches.
     """
     out = np.full(len(patches.lidars), stated_m)
-    every = np.ones(len(patches.scan), dtype=bool)
-    for i, found in enumerate(_scatter_parts(patches, every)):
-        if found is None:
-            own = every & (patches.scan_lidar[patches.scan] == i)
-            out[i] = _range_sigma_of_few(patches, own, stated_m)
-        else:
+    for i, found in enumerate(_scatter_parts(patches, np.ones(len(patches.scan), dtype=bool))):
+        if found is not None:
             out[i] = math.sqrt(max(float(found[0]), LEAST_RANGE_M**2))
     return out
-
-
-def _range_sigma_of_few(patches: DrivePatches, own: BoolArray, stated_m: float) -> float:
-    """Noise along the beam by too few patches to tell it from all else, which is as usual.
-
-    What is stated counts as `LEAST_PATCHES` of them.
-    """
-    cos, distance, variance = _scatter_of(patches, own & (patches.points >= LEAST_POINTS))
-    across = (BEAM_RAD * distance) ** 2 * (1.0 - cos**2) + ROUGHNESS_M**2
-    along = (variance - across) / np.maximum(cos, MIN_COS) ** 2
-    both = np.append(along, np.full(LEAST_PATCHES, stated_m**2))
-    return math.sqrt(max(float(np.median(both)), LEAST_RANGE_M**2))
 
 
 def roughness_m(patches: DrivePatches, of: BoolArray) -> Array:
@@ -128,7 +115,12 @@ def _scatter_parts(patches: DrivePatches, of: BoolArray) -> list[Array | None]:
     The variance of a patch is `sigma_r^2 cos^2 + (d sigma_b)^2 sin^2 + roughness^2`, d the
     distance. Medians of classes, as patches of leaves scatter more.
     """
-    cos, distance, variance = _scatter_of(patches, np.ones(len(patches.scan), dtype=bool))
+    centres = patches.centres_lidar
+    distance = np.linalg.norm(centres, axis=1)
+    cos = np.abs(np.einsum("ni,ni->n", centres, patches.normal_lidar)) / distance
+    free = np.maximum(patches.points - 3.0, 1.0)
+    # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
+    variance = patches.scatter_m**2 / (1.0 - 2.0 / (9.0 * free)) ** 3
     of = of & (patches.points >= LEAST_POINTS)
     out: list[Array | None] = []
     for i in range(len(patches.lidars)):
@@ -143,16 +135,6 @@ def _scatter_parts(patches: DrivePatches, of: BoolArray) -> list[Array | None]:
         ]
         out.append(_variance_parts(*np.array(medians).T))
     return out
-
-
-def _scatter_of(patches: DrivePatches, of: BoolArray) -> tuple[Array, Array, Array]:
-    """Cosine of the incidence, distance and scatter (n,) of some patches (N,); the last in m^2."""
-    centres = patches.centres_lidar[of]
-    distance = np.linalg.norm(centres, axis=1)
-    cos = np.abs(np.einsum("ni,ni->n", centres, patches.normal_lidar[of])) / distance
-    free = np.maximum(patches.points[of] - 3.0, 1.0)
-    # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
-    return cos, distance, patches.scatter_m[of] ** 2 / (1.0 - 2.0 / (9.0 * free)) ** 3
 
 
 def _variance_parts(cos: Array, distance_m: Array, variance: Array) -> Array:
@@ -215,6 +197,7 @@ def fitted_noise(
     fitted = float((seen * asked.of_offsets).sum() / PROBES / max(weights.sum(), 1.0))
     free = 1.0 - min(fitted, MOST_FITTED)
     point = 1.0 / sightings.moments[:, 3, 3]
+    point = point + nuisances.of_lidar(sightings.strip, lidar, level) ** 2
     total_sigma = common_sigma(offsets, point, free)
     limit = 3.0 * np.sqrt(point + total_sigma**2)
     shared = _shared_variance(np.clip(offsets, -limit, limit), group) / free
@@ -231,6 +214,9 @@ def fitted_noise(
         _strip_sigmas(asked, layout, nuisances.strip, errors), ONE_VIEW_M if one else LEAST_M
     )
     sighting = np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2))
+    known = 1.0 / sightings.moments[:, 3, 3] + shared + sighting[sightings.strip] ** 2
+    own_level = level[sightings.strip]
+    lidar_offsets = _lidar_offsets(offsets, known, lidar, own_level, free, layout.lidars)
     if one or not tilts:
         per_m = first_tilts_per_m(level)
         sizes = sighting * per_m, strip * per_m, nuisances.tilt_times
@@ -245,6 +231,7 @@ def fitted_noise(
         sighting_tilt=own_tilt,
         strip_tilt=strip_tilt,
         tilt_times=tilt_times,
+        lidar_offsets=lidar_offsets,
         shared=math.sqrt(shared),
         bias=_bias_sigma(asked, layout, nuisances.bias, errors, ranges),
         surface=_surface_sigma(asked, layout, nuisances.surface, errors, ranges.surface_m),
@@ -261,10 +248,11 @@ def seen_signs(
     sightings: Sightings,
     weights: Array,
     layout: Layout,
-    nuisances: Nuisances,
+    sigma_m: Array,
 ) -> Array:
     """(D, PROBES) `J^T W^1/2` times random signs, by which `tr(J H^-1 J^T W)` is estimated.
 
+    `sigma_m` (Q,) are the offsets' errors from scan to scan, the shared ones included;
     `geometry` is where the system was linearised. Of derivatives elsewhere a part is in directions
     that it does not determine, such as a turn of everything about a standing vehicle.
 
@@ -272,9 +260,8 @@ def seen_signs(
     of the system: an outlier without weight says nothing. By random signs (Hutchinson): the exact
     trace costs as much as all else together.
     """
-    sigma = np.hypot(nuisances.sighting[sightings.strip], nuisances.shared)
     J = geometry.offset_rows(sightings, layout.size)
-    root = np.sqrt(weights / offset_variances(sightings, sigma))
+    root = np.sqrt(weights / offset_variances(sightings, sigma_m))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (sightings.count, PROBES))
     return np.asarray(J.T @ (root[:, None] * signs))
 
@@ -321,6 +308,28 @@ class _Asked:
 def biases_of(layout: Layout) -> IntArray:
     """(n,) coordinates of the biases of the LiDARs' ranges."""
     return np.arange(layout.error, layout.beam, BIASES)
+
+
+def _lidar_offsets(
+    offsets: Array, known: Array, lidar: IntArray, level: BoolArray, free: float, lidars: int
+) -> Array:
+    """(L, 2) `Nuisances.lidar_offsets`: the sum of squares of each LiDAR is as expected.
+
+    Args:
+        offsets: (Q,) of the sightings.
+        known: (Q,) variances of these without it.
+        lidar: (Q,) the LiDAR of each.
+        level: (Q,) whether it is of ground.
+        free: share of the variance that the estimate has not taken up.
+        lidars: L.
+    """
+    out = np.zeros((lidars, 2))
+    for i in range(lidars):
+        for kind, of in enumerate((level, ~level)):
+            own = of & (lidar == i)
+            if np.count_nonzero(own) >= LEAST_SIGHTINGS:
+                out[i, kind] = common_sigma(offsets[own], known[own], free)
+    return out
 
 
 def common_sigma(offsets: Array, point: Array, free: float) -> float:

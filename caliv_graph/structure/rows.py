@@ -103,7 +103,7 @@ def whitened(
     group: IntArray,
     repeated: IntArray,
     alike: IntArray,
-    tilts: tuple[Array, Array],
+    errors: tuple[Array, Array, Array],
     nuisances: Nuisances,
     weights: Array,
     layout: Layout,
@@ -112,14 +112,14 @@ def whitened(
 
     `group` (Q,) numbers scan and surface of each, `repeated` (Q,) says how many scans have its
     view: what these share counts as often, so that their mean has the error of one. `alike` (Q,)
-    says how many sightings of its strip its LiDAR has. `tilts` are `Nuisances.tilts` of each.
+    says how many sightings of its strip its LiDAR has. `errors` are `Nuisances.errors` of each.
     `weights` (Q,) are robust.
     """
     more = repetition(nuisances, repeated)
-    own = nuisances.sighting[sightings.strip] * more
+    own_offset, own_tilt, strip_tilt = errors
+    own = own_offset * more
     # A strip that two LiDARs see apart they see tilted against each other, too, and alike in all
     # scans: bumps within it. As often as it is seen, so often the error counts.
-    own_tilt, strip_tilt = tilts
     tilt = np.sqrt((own_tilt * more) ** 2 + (alike - 1.0) * strip_tilt**2)
     S, noise = without_own_error(sightings, geometry.normals_lidar, own, tilt)
     S, noise = S * weights[:, None, None], noise * weights[:, None, None]

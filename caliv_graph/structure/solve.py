@@ -107,6 +107,7 @@ class Estimate:
             tilt_per_m=_medians(tilt_per_m, level, FIRST_TILT_PER_M),
             strip_tilt_rad=_medians(found.strip_tilt, level, (USUAL_RAD, USUAL_RAD)),
             tilt_times=found.tilt_times,
+            lidar_offsets=found.lidar_offsets,
         )
 
     def stands(self) -> Stands:
@@ -137,7 +138,7 @@ class Sighted(Estimate):
             groups_of(sightings, self.strips),
             problem.views.count[sightings.scan],
             alike(problem, sightings),
-            self.nuisances.tilts(sightings.strip, lidar, self.strips.level),
+            self.nuisances.errors(sightings.strip, lidar, self.strips.level),
             self.nuisances,
             self.weights,
             self.layout,
@@ -232,7 +233,8 @@ def _with_gradient(found: Sighted) -> tuple[Estimate, Array]:
 class Levels:
     """Noise levels, alike for all strips, with which a round begins: those of `Nuisances`.
 
-    `beams` is (E,), as of `Nuisances`, or None: as is usual; `tilt_times` are as there. Pairs are
+    `beams` is (E,), as of `Nuisances`, or None: as is usual; `tilt_times` and
+    `lidar_offsets` are as there. Pairs are
     of level strips, and of others: `bend_per_m`, tilts of sightings in offsets (`tilt_per_m`), and
     what a LiDAR repeats of tilts (`strip_tilt_rad`).
     """
@@ -247,6 +249,7 @@ class Levels:
     bend_per_m: Pair = (USUAL_PER_M, USUAL_PER_M)
     tilt_per_m: Pair = FIRST_TILT_PER_M
     tilt_times: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    lidar_offsets: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @staticmethod
     def first(sighting_m: float, strip_m: float, shared_m: float, ranges: RangeErrors) -> Levels:
@@ -497,6 +500,7 @@ def _round(
         bend=np.where(strips.level, *levels.bend_per_m),
         turn_rad_s=problem.turn_rad_s,
         tilt_times=levels.tilt_times,
+        lidar_offsets=levels.lidar_offsets,
     )
     weights = np.ones(sightings.count)
     unbent = np.ones(strips.count)
@@ -530,7 +534,10 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
     """
     found = without_residuals(held[0])
     problem, layout, sightings = found.problem, found.layout, found.sightings
-    seen = seen_signs(held[0].geometry, sightings, found.weights, layout, found.nuisances)
+    level, lidar = found.strips.level, problem.patches.scan_lidar[sightings.scan]
+    own = found.nuisances.offsets(sightings.strip, lidar, level)
+    sigma_m = np.hypot(own, found.nuisances.shared)
+    seen = seen_signs(held[0].geometry, sightings, found.weights, layout, sigma_m)
     system = systems.pop() if systems else _linearised(held)
     held.clear()
     factor, b = _factor(found, system)
@@ -538,7 +545,6 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
     give_back_freed_arrays()
     after = with_residuals(replace(found, state=stepped(found.state, layout, d)))
     geometry, state = after.geometry, after.state
-    lidar = problem.patches.scan_lidar[sightings.scan]
     nuisances = fitted_noise(
         geometry,
         seen,
@@ -553,11 +559,11 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
         found.nuisances,
         state.errors,
         problem.range_errors,
-        found.strips.level,
+        level,
         tilts,
     )
-    by_offset = robust_weights(geometry.offsets_m(sightings), sightings, nuisances)
-    level = found.strips.level
+    own = nuisances.offsets(sightings.strip, lidar, level)
+    by_offset = robust_weights(geometry.offsets_m(sightings), sightings, own, nuisances.shared)
     unbent = np.minimum(found.unbent, bend_weights(state.errors, layout, nuisances, level))
     of_ground = ground_weights(geometry, sightings, lidar, level) * unbent[sightings.strip]
     weights = np.minimum(by_offset, of_ground)

@@ -59,10 +59,18 @@ def ground_weights(
     return tilt_weights(geometry, sightings, level) * by_scatter
 
 
-def robust_weights(offsets_m: Array, sightings: Sightings, nuisances: Nuisances) -> Array:
-    """(Q,) weights by the offset of each sighting: full, falling to none between `SPREADS`."""
-    own = nuisances.sighting[sightings.strip]
-    variance = offset_variances(sightings, own) + nuisances.shared**2
+def robust_weights(
+    offsets_m: Array, sightings: Sightings, sigma_m: Array, shared_m: float
+) -> Array:
+    """(Q,) weights by the offset of each sighting: full, falling to none between `SPREADS`.
+
+    Args:
+        offsets_m: (Q,).
+        sightings: Q of them.
+        sigma_m: (Q,) `Nuisances.offsets`.
+        shared_m: `Nuisances.shared`.
+    """
+    variance = offset_variances(sightings, sigma_m) + shared_m**2
     return _falling(np.abs(offsets_m) / np.sqrt(variance), SPREADS)
 
 

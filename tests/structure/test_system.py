@@ -361,7 +361,7 @@ def test_many_scans_know_the_tilt_of_a_strip_no_better_than_its_bumps_let_them()
             np.arange(count),
             own,
             count * own,
-            nuisances.tilts(of, of, np.zeros(1, np.bool_)),
+            nuisances.errors(of, of, np.zeros(1, np.bool_)),
             nuisances,
             np.ones(count),
             layout,
@@ -424,8 +424,8 @@ def test_noise_of_points_says_nothing_of_their_channels(channels: int, each: int
     geometry = geometry_of(state, sightings, layout, none, none, None)
     one = np.ones(count, np.int64)
     nuisances = of_one_strip(strip_m=4e-4, sighting_m=1e-5, shared_m=1e-6)
-    tilts = nuisances.tilts(none, none, np.zeros(1, np.bool_))
-    rows = whitened(geometry, sightings, every, one, one, tilts, nuisances, np.ones(count), layout)
+    errors = nuisances.errors(none, none, np.zeros(1, np.bool_))
+    rows = whitened(geometry, sightings, every, one, one, errors, nuisances, np.ones(count), layout)
     own = slice(layout.beam, layout.beam + channels)
     pull = (rows.of_noise - rows.J.T @ rows.r)[own]
     told = np.sqrt((rows.J.T @ rows.J).diagonal()[own])
@@ -487,10 +487,12 @@ def test_errors_of_all_azimuths_and_a_turn_of_the_lidar_are_one_thing() -> None:
     two = np.full(2, 1e-4)
     levels = replace(levels, sighting=two, sighting_tilt=two, strip_tilt=two)
     one = np.ones(count, np.int64)
-    tilts = levels.tilts(none, none, np.zeros(2, np.bool_))
+    errors = levels.errors(none, none, np.zeros(2, np.bool_))
     for dents in (True, False):
         geometry = geometry_of(state, sightings, layout, none, none, None, dents=dents)
-        rows = whitened(geometry, sightings, every, one, one, tilts, levels, np.ones(count), layout)
+        rows = whitened(
+            geometry, sightings, every, one, one, errors, levels, np.ones(count), layout
+        )
         turn = np.zeros(layout.size)
         turn[layout.extrinsic + 2] = 1.0
         azimuths = np.zeros(layout.size)

@@ -394,6 +394,29 @@ def test_joint_information_is_less_than_each_cloud_s_own() -> None:
     assert np.trace(shift.T @ H @ shift) < 1e-3 * claimed
 
 
+def test_a_surfel_with_hardly_a_point_leaves_the_frame_free() -> None:
+    """Clouds that all turn together have no gradient: 0.003 of it took the frame 0.15 m away."""
+    scene = chair()
+    state = JointRegistration(scene.observation, CONFIG)
+    R, t = matrices(scene.T_target_lidar)
+    state.seed(R, t, 0.02)
+    for _ in range(3):
+        state.expect(R, t)
+        state.maximise(R, t)
+    surfels = state.mixture
+    tilted = surfels.normals_target + [0.2, 0.1, 0.0]
+    tilted /= np.linalg.norm(tilted, axis=1)[:, None]
+    away = 0.15 * surfels.normals_target
+    away[::2] = 0.0
+    mixture = replace(surfels, means_target=surfels.means_target + away, normals_target=tilted)
+
+    quadratic, _ = quadratic_at(state.clouds, R, t, mixture, state.noise, np.ones(12))
+
+    assert np.abs(quadratic.gradient.sum(axis=0)).max() < 1e-6
+    together = np.tile(np.eye(6), (12, 1))
+    assert np.abs(quadratic.joint() @ together).max() < 1e-6
+
+
 # ------------------------------------------------------------------ the steps
 
 

@@ -404,7 +404,7 @@ def test_a_surfel_with_hardly_a_point_leaves_the_frame_free() -> None:
         state.expect(R, t)
         state.maximise(R, t)
     surfels = state.mixture
-    tilted = surfels.normals_target + [0.2, 0.1, 0.0]
+    tilted = surfels.normals_target + np.array([0.2, 0.1, 0.0])
     tilted /= np.linalg.norm(tilted, axis=1)[:, None]
     away = 0.15 * surfels.normals_target
     away[::2] = 0.0

@@ -11,13 +11,16 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.given_noise import noise_by_structure
-from caliv_graph.calibration.noise import TYPICAL
+from caliv_graph.calibration.given_noise import noise_by_structure, residuals_of_structure
+from caliv_graph.calibration.graph import with_given_poses
+from caliv_graph.calibration.noise import TYPICAL, fit_pose_noise
 from caliv_graph.calibration.structure_evidence import NOTHING_TOLD, ToldErrors
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array, PoseNoise, Trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
+from tests.calibration.problems import make_case, noisy
 
 POSES = 48
 STAMPS_NS = np.arange(POSES) * 1_000_000_000
@@ -121,3 +124,30 @@ def test_white_errors_that_messages_state_are_known() -> None:
 
     assert found.white_position_m == pytest.approx(TRUE.white_position_m)
     assert found.drift_position_m == pytest.approx(0.015, rel=0.7)
+
+
+def test_walls_tell_what_clouds_of_a_target_do_not() -> None:
+    """Clouds that know their poses to a tenth of a radian and ten metres."""
+    case = make_case(count=24)
+    values = with_given_poses(case.problem, case.truth)
+    measured = noisy(case, 4)
+    vague = np.tile(np.diag([100.0] * 3 + [0.01] * 3), (len(measured), 1, 1))
+    every = np.ones(len(measured), dtype=np.bool_)
+    walls = residuals_of_structure(told(1, TRUE), {0: STAMPS_NS}, [circle()], config())
+
+    found, _ = fit_pose_noise(
+        case.problem, measured, vague, every, values, NoiseConfig(), of_poses=walls
+    )
+
+    by_walls = found_by(told(1, TRUE), config())
+    for name in (
+        "white_rotation_rad",
+        "white_position_m",
+        "drift_rotation_rad",
+        "drift_position_m",
+    ):
+        assert getattr(found, name) == pytest.approx(getattr(by_walls, name), rel=0.1), name
+
+
+def test_without_word_of_structure_the_clouds_are_asked_alone() -> None:
+    assert residuals_of_structure(NOTHING_TOLD, {}, [], config()) is None

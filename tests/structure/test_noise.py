@@ -14,7 +14,7 @@ from caliv_graph.structure.beams import (
     parts_of,
     usual_sigmas,
 )
-from caliv_graph.structure.noise import beam_sigmas, range_sigmas
+from caliv_graph.structure.noise import _lidar_offsets, beam_sigmas, range_sigmas
 from caliv_graph.structure.patches import DrivePatches
 
 POINTS = 20
@@ -99,3 +99,20 @@ def test_two_channels_that_err_much_are_not_all_of_them() -> None:
     found = sizes_of(true, usual)[CHANNELS : 2 * CHANNELS]
     assert np.median(found) == pytest.approx(1e-4, rel=0.3)
     assert found[[3, 4]].min() > 1e-3
+
+
+def test_the_lidar_whose_offsets_scatter_by_more_has_an_error_of_its_own() -> None:
+    """6 mm on walls alone; others that are as noisy as their sightings say have hardly any."""
+    rng = np.random.default_rng(9)
+    lidar = np.repeat([0, 1, 2], [2000, 400, 10])
+    level = np.arange(len(lidar)) % 2 == 0
+    known = np.full(len(lidar), 2e-3**2)
+    of_lidar = np.where((lidar == 1) & ~level, 6e-3, 0.0) + np.where(lidar == 2, 0.1, 0.0)
+    offsets = np.sqrt(known + of_lidar**2) * rng.standard_normal(len(lidar))
+
+    found = _lidar_offsets(offsets, known, lidar, level, 1.0, 4)
+
+    assert found[1, 1] == pytest.approx(6e-3, rel=0.15)
+    assert found[0].max() < 6e-4
+    assert found[1, 0] < 8e-4
+    assert (found[2:] == 0.0).all()  # ten sightings tell nothing, none even less

@@ -25,7 +25,7 @@ from caliv_graph.calibration.no_target import (
     solution_without_target,
     solve_structure_and_ground,
 )
-from caliv_graph.calibration.noise import PoseResiduals
+from caliv_graph.calibration.noise import PoseResiduals, all_stated
 from caliv_graph.calibration.problem import Problem, pose_problem, usable
 from caliv_graph.calibration.rates import with_rates_of
 from caliv_graph.calibration.refine import (
@@ -45,6 +45,7 @@ from caliv_graph.calibration.sensor_noise import (
 )
 from caliv_graph.calibration.solve import (
     SolveState,
+    fit_noise,
     reduced_registered,
     settle,
     solve_registered,
@@ -69,6 +70,7 @@ from caliv_graph.errors import RegistrationError, SolveError
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import (
     GroundObservation,
+    IntArray,
     Registration,
     Solution,
     StructureTerm,
@@ -168,11 +170,15 @@ def _estimate(
         drives = trajectories, grounds, structure
         trajectories, grounds, walls = _about_walls(drives, placed, extrinsics, config)
         start = walls.T_vehicle_lidar or placed
-        told = structure.slow_errors(trajectories, start, extrinsics, config)
-        poses, stamps_ns = structure.pose_errors(trajectories, start, config)
+        slow = structure.slow_errors(trajectories, start, extrinsics, config)
+        poses, stamps_ns = NOTHING_TOLD, dict[int, IntArray]()
+        if not all_stated(config.noise):
+            poses, stamps_ns = structure.pose_errors(trajectories, start, config)
         of_poses = residuals_of_structure(poses, stamps_ns, trajectories, config)
-        told = next((of for of in (told, poses) if of.T_vehicle_lidar), walls)
-        noise = estimated_noise(rough.state, rough.registrations, before, told.of_drives)
+        if of_poses is not None:
+            fit_noise(rough.state, rough.registrations, of_poses)
+        told = next((of for of in (slow, poses) if of.T_vehicle_lidar), walls)
+        noise = estimated_noise(rough.state, rough.registrations, before, slow.of_drives)
         trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)
         problem = pose_problem(observations, trajectories, config, noise, kept_ns=kept)
     times = {"registration": rough.registration_s, "graph": rough.graph_s}

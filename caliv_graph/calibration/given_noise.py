@@ -38,15 +38,12 @@ def noise_by_structure(
     walls = residuals_of_structure(told, stamps_ns, trajectories, config)
     if walls is None:
         return first_pose_noise(config.noise)
-    of_messages = np.concatenate(
-        [_stated(trajectories[drive], stamps_ns[drive], config) for drive in told.of_drives]
-    )
-    every = bool(of_messages.any(axis=(1, 2)).all())
+    stated = [_stated(trajectories[drive], stamps_ns[drive], config) for drive in told.of_drives]
     return expected_noise(
         [walls],
         config.noise,
-        open_levels=(not every, True),
-        of_messages=of_messages if every else None,
+        open_levels=(walls.unstated, True),
+        of_messages=None if walls.unstated else np.concatenate(stated),
     )
 
 
@@ -113,7 +110,8 @@ def residuals_of_structure(
 
     by_message = [of.any(axis=(1, 2)) for of in stated]
     white_parts = of_drives([np.diag(np.where(of, 0.0, 1.0)) for of in by_message])
-    return PoseResiduals(observed, white_parts, slow)
+    every = bool(np.concatenate(by_message).all())
+    return PoseResiduals(observed, white_parts, slow, unstated=not every)
 
 
 def _stated(trajectory: VehicleTrajectory, stamps_ns: IntArray, config: Config) -> Array:

@@ -98,6 +98,11 @@ def _configured(noise: NoiseConfig) -> list[float | None]:
     return [white, noise.pose_position_m, drift, noise.pose_drift_position_m]
 
 
+def all_stated(noise: NoiseConfig) -> bool:
+    """Whether a config leaves nothing open of the noise of given poses."""
+    return None not in (*_configured(noise), noise.pose_drift_time_s)
+
+
 def first_pose_noise(noise: NoiseConfig) -> PoseNoise:
     """The values of the config, and `TYPICAL` for the others."""
     *typical, time_s = astuple(TYPICAL)
@@ -144,12 +149,14 @@ class PoseResiduals:
         white: their covariances (N, N) by white errors, rotation and position, at sigma 1.
         slow: the same of Gauss-Markov errors, by their correlation time in seconds.
         clouds: registrations of clouds among the residuals.
+        unstated: whether there are poses whose messages do not state their white errors.
     """
 
     observed: Observed
     white: tuple[Array, Array]
     slow: Callable[[float], tuple[Array, Array]]
     clouds: Sequence[Block] = ()
+    unstated: bool = True
 
     def likelihood(self, time_s: float, clouds: Sequence[Component]) -> Likelihood:
         """At a correlation time; the unknowns 0 to 3 are the sigmas of `PoseNoise`, in order."""
@@ -192,13 +199,17 @@ def fit_pose_noise(
         for row, cov in enumerate(np.linalg.inv(information[chosen]))
     ]
     given, stated = problem.given(), problem.stated()
-    of_messages = None
-    if problem.stated_cov is not None and stated.any() and not (given & ~stated).any():
+    of_messages, evidence = None, [PoseResiduals(observed, white, slow, clouds)]
+    unstated, some = bool((given & ~stated).any()), bool(given.any())
+    if of_poses is not None:
+        evidence.append(of_poses)
+        unstated, some = unstated or of_poses.unstated, True
+    if problem.stated_cov is not None and stated.any() and not unstated:
         of_messages = problem.stated_cov[stated]
     noise = expected_noise(
-        [PoseResiduals(observed, white, slow, clouds), *([] if of_poses is None else [of_poses])],
+        evidence,
         config,
-        open_levels=(bool((given & ~stated).any()), bool(given.any())),
+        open_levels=(unstated, some),
         of_messages=of_messages,
     )
     if not clouds:

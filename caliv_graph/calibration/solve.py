@@ -173,6 +173,22 @@ def solve_registered(
     return state
 
 
+def fit_noise(
+    state: SolveState, registrations: Sequence[Registration], of_poses: PoseResiduals
+) -> None:
+    """Estimates the noise of a solved graph again, with what structure says of given poses.
+
+    For what is solved from there; the graph is not solved again.
+    """
+    measured, information = measured_poses(registrations, state.turns)
+    single = of_single_clouds(information, registrations)
+    given = with_given_poses(state.problem, state.values)
+    state.of_poses = of_poses
+    state.noise, state.scale = fit_pose_noise(
+        state.problem, measured, single, state.sound, given, state.config.noise, of_poses
+    )
+
+
 def _reweight(
     state: SolveState,
     registrations: Sequence[Registration],

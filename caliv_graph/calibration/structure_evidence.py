@@ -229,7 +229,8 @@ class StructureEvidence:
     ) -> tuple[ToldErrors, dict[int, IntArray]]:
         """What the structure of drives with given poses says of these; and at which stamps.
 
-        `start` are rough T_vehicle_lidar of every LiDAR.
+        `start` are rough T_vehicle_lidar of every LiDAR. None is held where a target has placed
+        it: what that is off by would be an error of all poses.
 
         Raises:
             SolveError: it could not be solved.

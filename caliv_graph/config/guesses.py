@@ -42,8 +42,13 @@ def configured_guess(config: Config, name: str) -> Guess:
         ConfigError: there is none.
     """
     lidar = config.lidars[name]
-    sigmas = TRUSTED_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
-    return Guess(lidar.guess(), sigmas, lidar.fixed, isinstance(lidar, FoundLidarConfig))
+    found = isinstance(lidar, FoundLidarConfig)
+    return Guess(lidar.guess(), stated_sigmas(lidar), lidar.fixed, found)
+
+
+def stated_sigmas(lidar: LidarConfig) -> Array:
+    """(6,) 1 sigma of the guess of a LiDAR, vehicle axes, rad and m."""
+    return TRUSTED_SIGMAS if lidar.fixed else lidar.sigma.sigmas()
 
 
 def prior_sigmas(guess: Guess) -> Array:

@@ -29,6 +29,9 @@ DISTINCT = 10.0
 HUBER_SIGMAS = 2.0
 """Middles that are farther off pull no harder: some clouds are of something else."""
 
+FARTHEST = 3.0
+"""Sigmas beyond which a middle is not where the motion has it: its cloud begins in the centre."""
+
 STEPS = 8
 """Gauss-Newton steps; the problem is almost linear."""
 
@@ -44,7 +47,8 @@ def placed_by_motion(
     Least squares: the centre, and an error of each LiDAR's guess, by which all middles are in the
     centre. What is left of them is where the motion has each. They keep that as far as it is known
     better than the middle is: what middles scatter across the view by more than their sigmas is an
-    error of the motion. Where that is more than `MOST_MOTION_M`, all middles are in the centre.
+    error of the motion. Where that is more than `MOST_MOTION_M`, all middles are in the centre, and
+    so is one that is farther off than both allow.
 
     Args:
         middles: of the clouds.
@@ -89,7 +93,10 @@ def placed_by_motion(
     motion = _excess(left[:, 1:], middles.sigmas_m[:, 1:])
     if motion is None:
         return np.zeros_like(t)
-    kept = middles.sigmas_m**2 / (middles.sigmas_m**2 + motion)
+    total = middles.sigmas_m**2 + motion
+    kept = middles.sigmas_m**2 / total
+    # A pose that is off by itself, as after a jump of the fixes, says nothing of its cloud.
+    kept[(np.abs(left) > FARTHEST * np.sqrt(total)).any(axis=1)] = 0.0
     return np.asarray(np.einsum("jba,jb->ja", middles.axes, kept * left))
 
 

@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
-from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS
+from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, stated_sigmas
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
@@ -155,7 +155,7 @@ class JointRegistration:
         )
         self._components = config.registration.components // (2 if rough else 1)
         self._gamma = config.registration.outlier_ratio
-        self._guess_sigmas = {name: of.sigma.sigmas() for name, of in config.lidars.items()}
+        self._guess_sigmas = {name: stated_sigmas(of) for name, of in config.lidars.items()}
         self.tolerance = ROUGH_TOLERANCE if rough else STEP_TOLERANCE
         self._floor_end = FLOOR_PER_RANGE_SIGMA * config.noise.lidar_range_m
         self._floor = COARSE_SIGMA_M

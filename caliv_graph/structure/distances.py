@@ -120,7 +120,8 @@ def other_strips(used: Solved, problem: Problem) -> OtherStrips | None:
     own = _about_own_mean(geometry.offsets_m(sightings), sightings, lidar, strips.count)
     usual = float(np.median(used.nuisances.sighting))
     shared = used.nuisances.shared
-    spread = own**2 - 1.0 / sightings.moments[:, 3, 3] - shared**2
+    of_lidar = used.nuisances.of_lidar(sightings.strip, lidar, strips.level)
+    spread = own**2 - 1.0 / sightings.moments[:, 3, 3] - shared**2 - of_lidar**2
     count = np.bincount(sightings.strip, minlength=strips.count)
     total = np.bincount(sightings.strip, spread, strips.count)
     least = 0.5 * usual
@@ -368,7 +369,9 @@ def _drawn_offsets(
         errors[first:last] = sigma * rng.standard_normal((last - first, DRAWS))
     _, number = np.unique(group, return_inverse=True)
     shared = nuisances.shared * rng.standard_normal((int(number.max()) + 1, DRAWS))
-    own = np.sqrt(1.0 / sightings.moments[:, 3, 3] + nuisances.sighting[sightings.strip] ** 2)
+    lidar = other.problem.patches.scan_lidar[sightings.scan]
+    sigma_m = nuisances.offsets(sightings.strip, lidar, other.strips.level)
+    own = np.sqrt(1.0 / sightings.moments[:, 3, 3] + sigma_m**2)
     noise = own[:, None] * rng.standard_normal((sightings.count, DRAWS))
     by_all = geometry.offset_rows(sightings, layout.size)
     return np.asarray(by_all @ errors + shared[number.ravel()] + noise)

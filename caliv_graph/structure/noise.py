@@ -196,8 +196,9 @@ def fitted_noise(
     asked = _Asked.of(solve, layout, seen)
     fitted = float((seen * asked.of_offsets).sum() / PROBES / max(weights.sum(), 1.0))
     free = 1.0 - min(fitted, MOST_FITTED)
-    point = 1.0 / sightings.moments[:, 3, 3]
-    point = point + nuisances.of_lidar(sightings.strip, lidar, level) ** 2
+    of_points = 1.0 / sightings.moments[:, 3, 3]
+    of_lidar = nuisances.of_lidar(sightings.strip, lidar, level) ** 2
+    point = of_points + of_lidar
     total_sigma = common_sigma(offsets, point, free)
     limit = 3.0 * np.sqrt(point + total_sigma**2)
     shared = _shared_variance(np.clip(offsets, -limit, limit), group) / free
@@ -214,7 +215,8 @@ def fitted_noise(
         _strip_sigmas(asked, layout, nuisances.strip, errors), ONE_VIEW_M if one else LEAST_M
     )
     sighting = np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2))
-    known = 1.0 / sightings.moments[:, 3, 3] + shared + sighting[sightings.strip] ** 2
+    every = common**2 + shared + float(of_lidar.mean())
+    known = of_points + shared + sighting[sightings.strip] ** 2
     own_level = level[sightings.strip]
     lidar_offsets = _lidar_offsets(offsets, known, lidar, own_level, free, layout.lidars)
     if one or not tilts:
@@ -236,7 +238,7 @@ def fitted_noise(
         bias=_bias_sigma(asked, layout, nuisances.bias, errors, ranges),
         surface=_surface_sigma(asked, layout, nuisances.surface, errors, ranges.surface_m),
         strip=strip,
-        repeated=1.0 if one else float(np.clip(again / (common**2 + shared), 0.0, 1.0)),
+        repeated=1.0 if one else float(np.clip(again / every, 0.0, 1.0)),
         beams=_beam_sigmas(covariance, layout, nuisances.beams, errors, ranges),
         bend=_bend_sigmas(asked, layout, nuisances.bend, errors, level, one),
         jitter_s=_jitter_sigma(asked, layout, nuisances.jitter_s, errors),

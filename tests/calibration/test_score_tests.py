@@ -99,7 +99,7 @@ def test_a_mount_that_slips_in_the_middle_shows_in_the_halves_by_as_much() -> No
     # Points farther left in the cloud: a LiDAR farther right, in the second half.
     assert d[4] == pytest.approx(0.06, abs=3.0 * math.sqrt(cov[4, 4]))
     # The slow error of the poses takes its part of so small a slip, but not the most of it.
-    assert d[4] > 0.02
+    assert d[4] > 0.03
     assert d[4] > 2.5 * math.sqrt(cov[4, 4])
     assert p_value(slipped) < 0.5 * p_value(still)
 

@@ -34,7 +34,7 @@ class Nuisances:
         strip_tilt: (K,) tilt that a LiDAR sees each strip have in all scans against what others
             see, rad; not metres.
         lidar_offsets: (L, 2) what a LiDAR adds to `sighting`, on level strips and on others: noise
-            that is more than it seems. Of one LiDAR alone the two are not told apart. Empty: zero.
+            that is more than it seems. Zero of the LiDAR that has the least; empty: of all.
         tilt_times: (L, 2) how much larger both tilts are of each LiDAR, on level strips and on
             others; empty: of none.
         shared: offset of a surface from scan to scan, which its strips share: incidence, and how

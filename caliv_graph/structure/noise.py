@@ -79,7 +79,7 @@ MOST_JITTER_S = 0.02
 """1 sigma of the jitter of stamps: 20 um at 2 m/s, and a fifth of a revolution."""
 
 LEAST_SIGHTINGS = 20
-"""Sightings of a LiDAR that tell how much more its offsets err than those of all, at least."""
+"""Sightings of a LiDAR that tell how much more its offsets err than those of others, at least."""
 
 PROBES = 20
 """Random vectors for the trace: it is then good to a few percent."""
@@ -317,6 +317,9 @@ def _lidar_offsets(
 ) -> Array:
     """(L, 2) `Nuisances.lidar_offsets`: the sum of squares of each LiDAR is as expected.
 
+    Beyond that of the LiDAR that has the least: what all have is the strips'. Else the two would
+    be told apart by nothing, and one of them go to zero.
+
     Args:
         offsets: (Q,) of the sightings.
         known: (Q,) variances of these without it.
@@ -326,11 +329,13 @@ def _lidar_offsets(
         lidars: L.
     """
     out = np.zeros((lidars, 2))
-    for i in range(lidars):
-        for kind, of in enumerate((level, ~level)):
-            own = of & (lidar == i)
-            if np.count_nonzero(own) >= LEAST_SIGHTINGS:
-                out[i, kind] = common_sigma(offsets[own], known[own], free)
+    for kind, of in enumerate((level, ~level)):
+        own = [of & (lidar == i) for i in range(lidars)]
+        told = [i for i in range(lidars) if np.count_nonzero(own[i]) >= LEAST_SIGHTINGS]
+        for i in told:
+            out[i, kind] = common_sigma(offsets[own[i]], known[own[i]], free)
+        if told:
+            out[told, kind] = np.sqrt(out[told, kind] ** 2 - out[told, kind].min() ** 2)
     return out
 
 

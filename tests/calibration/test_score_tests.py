@@ -88,18 +88,18 @@ def test_a_clock_that_is_late_is_told_with_which_and_how() -> None:
 
 
 def test_a_mount_that_slips_in_the_middle_shows_in_the_halves_by_as_much() -> None:
-    """60 mm, too little for a robust kernel to drop much."""
+    """50 mm, too little for a robust kernel to drop much."""
     clouds = len(eight().recording.clouds["front"])
-    drive = displaced(eight(), "front", (0.0, 0.06, 0.0), lambda k: 2 * k >= clouds)
+    drive = displaced(eight(), "front", (0.0, 0.05, 0.0), lambda k: 2 * k >= clouds)
     run = run_on(drive)
     assert run.record is not None
     found = {(c.lidar, c.kind): c for c in score_tests(run.solution, run.record.trajectories)}
     slipped, still = found["front", "halves"], found["rear", "halves"]
     d, cov, _ = difference(slipped)
     # Points farther left in the cloud: a LiDAR farther right, in the second half.
-    assert d[4] == pytest.approx(0.06, abs=3.0 * math.sqrt(cov[4, 4]))
+    assert d[4] == pytest.approx(0.05, abs=3.0 * math.sqrt(cov[4, 4]))
     # The slow error of the poses takes its part of so small a slip, but not the most of it.
-    assert d[4] > 0.03
+    assert d[4] > 0.025
     assert d[4] > 2.5 * math.sqrt(cov[4, 4])
     assert p_value(slipped) < 0.5 * p_value(still)
 

@@ -252,6 +252,9 @@ def expected_noise(
         unknowns.append(Unknown(kept, LOG_SPREAD, (low, high) if free else (kept, kept)))
     levels, of_clouds = len(unknowns), list[list[Component]]()
     for of in evidence:
+        if not of.clouds:
+            of_clouds.append([])
+            continue
         scale = len(unknowns)
         numbered = enumerate(of.clouds, start=scale + 1)
         of_clouds.append([Component(block, (scale, number)) for number, block in numbered])

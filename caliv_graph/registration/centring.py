@@ -91,13 +91,6 @@ def middles_of(
     return Middles(np.einsum("jba,jb->ja", R, in_map), axes, sigmas_m)
 
 
-def centre_clouds(
-    clouds: CloudStack, R: Array, t: Array, cut: Sequence[frozenset[Side]] = ()
-) -> Array:
-    """(J, 3) translations that put the middle of every cloud's extent at the origin."""
-    return -np.asarray(np.einsum("jab,jb->ja", R, middles_of(clouds, R, t, cut).points))
-
-
 def _cut_ends(sides: frozenset[Side], R_target_lidar: Array, axes: Array) -> BoolArray:
     """(2, 2) which ends are cut, right and left, bottom and top, in the axes of a view (3, 3).
 

@@ -381,8 +381,8 @@ def register_jointly(
         state: the clouds; its mixture is seeded here.
         T_target_lidar: pre-alignment, a pose per cloud; right to about 10 degrees, at any position.
         max_iterations: at most.
-        coarse: False if the pre-alignment is right to 1 or 2 cm: the clouds are then not centred,
-            and annealing begins finer.
+        coarse: False if the pre-alignment is right to 1 or 2 cm: the clouds then begin there, and
+            annealing begins finer.
         other_starts: False if a few clouds may end at a wrong place.
 
     Raises:

@@ -1,8 +1,8 @@
 """Other starts for clouds that show less of the target than the rest.
 
-The pre-alignment puts the middles of all clouds together. A cloud without its lower third is then
-off by a sixth of the target's height, and may end in the nearest fit instead of the right one. Such
-a cloud is tried at several places on the shape of the others; the best explanation wins.
+Where the motion says little, clouds begin with their middles together. One without its lower third
+is then off by a sixth of the target's height, and may end in the nearest fit instead of the right
+one. Such a cloud is tried at several places on the shape of the others; the best explanation wins.
 """
 
 from __future__ import annotations

@@ -15,7 +15,8 @@ from caliv_graph.config.model import Config, RegistrationConfig
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.geometry.se3 import stack
-from caliv_graph.products import Array, TargetCloud, TargetObservation
+from caliv_graph.products import Array, Side, TargetCloud, TargetObservation
+from caliv_graph.registration.centring import middles_of
 from caliv_graph.registration.clouds import CloudStack
 from caliv_graph.scenario.model import CropModel
 from caliv_graph.scenario.sensor_models import LidarModel
@@ -198,3 +199,10 @@ def stack_of(
         whole=(points,),
         sigma_range_m=sigma_range_m,
     )
+
+
+def centre_clouds(
+    clouds: CloudStack, R: Array, t: Array, cut: Sequence[frozenset[Side]] = ()
+) -> Array:
+    """(J, 3) translations that put the middle of every cloud's extent at the origin."""
+    return -np.asarray(np.einsum("jab,jb->ja", R, middles_of(clouds, R, t, cut).points))

@@ -16,7 +16,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, Mixture, Registration, Side
-from caliv_graph.registration.centring import centre_clouds, depth_of
+from caliv_graph.registration.centring import depth_of
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.heights import HeightNoise
 from caliv_graph.registration.mixture import LEAST_EXTENT_M, expect, maximise_shape, seed_mixture
@@ -35,6 +35,7 @@ from caliv_graph.registration.register import (
 from caliv_graph.registration.surfels import Surfels
 from tests.registration.scenes import (
     Scene,
+    centre_clouds,
     chair_scene,
     config_of,
     errors,

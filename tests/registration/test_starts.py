@@ -10,7 +10,6 @@ import pytest
 
 from caliv_graph.products import Array, Side
 from caliv_graph.registration import register
-from caliv_graph.registration.centring import centre_clouds
 from caliv_graph.registration.clouds import CloudStack, stack_clouds
 from caliv_graph.registration.register import (
     JointRegistration,
@@ -19,6 +18,7 @@ from caliv_graph.registration.register import (
 from caliv_graph.registration.starts import Suspicion, _shifts, suspicious
 from tests.registration.scenes import (
     Scene,
+    centre_clouds,
     chair_scene,
     config_of,
     guesses,

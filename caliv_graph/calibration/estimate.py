@@ -176,7 +176,8 @@ def _estimate(
             poses, stamps_ns = structure.pose_errors(trajectories, start, config)
         of_poses = residuals_of_structure(poses, stamps_ns, trajectories, config)
         if of_poses is not None:
-            fit_noise(rough.state, rough.registrations, of_poses)
+            rough.state.of_poses = of_poses
+            fit_noise(rough.state, rough.registrations)
         told = next((of for of in (slow, poses) if of.T_vehicle_lidar), walls)
         noise = estimated_noise(rough.state, rough.registrations, before, slow.of_drives)
         trajectories, grounds = _with_noise(noise, trajectories, grounds, start, config)

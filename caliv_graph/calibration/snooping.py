@@ -7,20 +7,18 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from caliv_graph.calibration.graph import with_given_poses
 from caliv_graph.calibration.kernels import DOF
 from caliv_graph.calibration.linear import adjusted_residuals, dense_system, linearise_clouds
-from caliv_graph.calibration.noise import fit_pose_noise
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.robust import MIN_WEIGHT, deletion_squares, own_blocks
 from caliv_graph.calibration.solve import (
     SolveState,
     cloud_residuals,
     explained_parts,
+    fit_noise,
     guessed_graph,
     joint_information,
     measured_poses,
-    of_single_clouds,
     settle,
     step_of_all,
 )
@@ -68,8 +66,7 @@ def _snoop(state: SolveState, registrations: Sequence[Registration]) -> None:
         return
     problem, fitted = state.problem, (state.noise, state.scale)
     sound, weights, values = state.sound, state.weights.values, state.values
-    measured, information = measured_poses(registrations, state.turns)
-    single = of_single_clouds(information, registrations)
+    measured, _ = measured_poses(registrations, state.turns)
     explained = explained_parts(registrations)
     whole = np.maximum(explained, MIN_WEIGHT)
     state.weights.values = whole
@@ -83,10 +80,7 @@ def _snoop(state: SolveState, registrations: Sequence[Registration]) -> None:
         if (by == sound).all():
             state.noise, state.scale = fitted
         else:
-            given = with_given_poses(problem, state.values)
-            state.noise, state.scale = fit_pose_noise(
-                problem, measured, single, by, given, state.config.noise, state.of_poses
-            )
+            fit_noise(state, registrations)
         # Clouds that are a metre off bend the values so much that all others seem to be off.
         state.weights.values = np.where(by, whole, MIN_WEIGHT)
         settle(state, registrations, step_of_all(state))

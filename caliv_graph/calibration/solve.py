@@ -163,9 +163,7 @@ def solve_registered(
     given = with_given_poses(problem, state.values)
     single = of_single_clouds(information, registrations)
     state.sound = sound_clouds(problem, measured, single, given, state.noise) & (explained > 0.5)
-    state.noise, state.scale = fit_pose_noise(
-        problem, measured, single, state.sound, given, config.noise, of_poses
-    )
+    fit_noise(state, registrations)
     state.weights = robust
     rounds = REWEIGHTINGS * state.weights.kernel.patience
     _reweight(state, registrations, measured, information, explained, rounds)
@@ -173,19 +171,16 @@ def solve_registered(
     return state
 
 
-def fit_noise(
-    state: SolveState, registrations: Sequence[Registration], of_poses: PoseResiduals
-) -> None:
-    """Estimates the noise of a solved graph again, with what structure says of given poses.
+def fit_noise(state: SolveState, registrations: Sequence[Registration]) -> None:
+    """Estimates the noise levels of a solved graph, which is not solved again, by its sound clouds.
 
-    For what is solved from there; the graph is not solved again.
+    And by what structure says of given poses (`of_poses`).
     """
     measured, information = measured_poses(registrations, state.turns)
     single = of_single_clouds(information, registrations)
     given = with_given_poses(state.problem, state.values)
-    state.of_poses = of_poses
     state.noise, state.scale = fit_pose_noise(
-        state.problem, measured, single, state.sound, given, state.config.noise, of_poses
+        state.problem, measured, single, state.sound, given, state.config.noise, state.of_poses
     )
 
 

@@ -123,6 +123,11 @@ def clock_findings(
     estimated as off, the fewer wrong clocks are the likelier: that one, unless one LiDAR alone
     explains as much. Clocks that are all right by that are compared with each other: of this the
     motion data's own errors are no part, and a millisecond shows.
+
+    The clock of given poses is a variable of the graph, whose estimate has what all LiDARs of a
+    drive share against it: that they all are late is not said. Velocities have the noise of the
+    poses in them, and so has how these move what carries the vehicle: of a slow robot whose clocks
+    were right all four LiDARs were 53 +- 8 ms late, where the graph had 0.0 +- 0.1.
     """
     if _has_culprit(calibration):
         return ()
@@ -133,14 +138,19 @@ def clock_findings(
         if name in ("imu_time_offset", "twist_time_offset", "pose_time_offset")
     ]
 
+    of_poses = "pose_time_offset" in calibration.vehicle
+
     def against(imu_late_s: float) -> tuple[Finding, ...]:
-        return tuple(
-            finding
-            for term in terms
-            for lidar, (late_s, sigma_s) in term.clocks.items()
-            for finding in [clock_finding(names[term.drive], lidar, late_s + imu_late_s, sigma_s)]
-            if finding is not None
-        )
+        out: list[Finding] = []
+        for term in terms:
+            of_lidars = [
+                clock_finding(names[term.drive], lidar, late_s + imu_late_s, sigma_s)
+                for lidar, (late_s, sigma_s) in term.clocks.items()
+            ]
+            found = [finding for finding in of_lidars if finding is not None]
+            if len(found) < len(of_lidars) or not of_poses:
+                out.extend(found)
+        return tuple(out)
 
     found = min(against(0.0), against(sum(inertial)), key=len)
     return found or _apart(names, terms)

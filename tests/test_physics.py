@@ -155,6 +155,12 @@ def test_a_clock_that_walls_contradict_leads_where_the_ranking_has_no_culprit() 
     assert clock_findings(["drive"], [term(front=early, rear=early)], late) == ()
     (alone,) = clock_findings(["drive"], [term(front=early, rear=(0.0, 0.0))], late)
     assert alone.input == "lidars.front.time_offset"
+    # Against given poses, whose clock the graph estimates, all being late says nothing of LiDARs.
+    poses = {"pose_time_offset": VehicleParameter(np.zeros(1), np.full(1, 1e-4), (True,))}
+    given = replace(calm, vehicle=poses)
+    assert clock_findings(["drive"], [term(front=(0.053, 0.008), rear=(0.053, 0.008))], given) == ()
+    (alone,) = clock_findings(["drive"], [term(front=(0.053, 0.008), rear=(0.0, 0.008))], given)
+    assert alone.input == "lidars.front.time_offset"
     # 4.5 sigma are a warning, 3.9 are nothing.
     (doubt,) = clock_findings(["drive"], [term(front=(-0.009, 0.0))], calm)
     assert doubt.severity == "warning"

@@ -24,6 +24,7 @@ from caliv_graph.mounting.sharpness import (
 from caliv_graph.mounting.upright import Ground, ground_below
 from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
 from caliv_graph.structure.planar import ScanPatches, planar_patches
+from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.targets.ground.surface import HALF_SIZE_M, fit_surface
 from caliv_graph.targets.search.find import scans_to_read
 from caliv_graph.trajectory.deskew import checked_times
@@ -174,12 +175,13 @@ def view_of(
     lidar = config.lidars[name]
     scans: list[_Scan] = []
     patches: list[ScanPatches] = []
+    noise = RangeNoise.constant(config.noise.lidar_range_m)
     looked = set(_even(len(stamps_ns), GROUND_SCANS).tolist())
     for k, scan in enumerate(recording.scans(name, wanted=set(stamps_ns.tolist()))):
         range_m = np.linalg.norm(scan.points_lidar, axis=1)
         near = (range_m >= lidar.min_range) & (range_m <= lidar.max_range)
         if k in looked or len(near) < FEW_POINTS:
-            patches.append(planar_patches(scan.points_lidar[near], config.noise.lidar_range_m))
+            patches.append(planar_patches(scan.points_lidar[near], noise))
         scans.append(_thinned(scan, near & (range_m < FARTHEST_M)))
         advance()
     ground = ground_below(patches)

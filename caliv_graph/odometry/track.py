@@ -16,6 +16,7 @@ from caliv_graph.geometry.se3 import cross
 from caliv_graph.odometry.surface_map import SurfaceMap, point_to_plane
 from caliv_graph.products import Array, IntArray, LidarScan
 from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
+from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.structure.sightings import moved_moments
 from caliv_graph.trajectory.deskew import checked_times
 from caliv_graph.trajectory.imu import exp_so3
@@ -119,7 +120,7 @@ class _Tracker:
         self.stamps_ns: list[int] = []
         self.poses: list[gtsam.Pose3] = []
         self.patches: list[ScanPatches] = []
-        self._sigma_range_m = sigma_range_m
+        self._noise = RangeNoise.constant(sigma_range_m)
         self._twist = twist
         self._begun = begun
         self._map = SurfaceMap()
@@ -205,13 +206,13 @@ class _Tracker:
         """The patches of a scan, each at its own time."""
         times_s = checked_times(scan)
         if times_s is None or not len(times_s):
-            return planar_patches(scan.points_lidar, self._sigma_range_m)
+            return planar_patches(scan.points_lidar, self._noise)
         first_s = float(times_s.min())
         slots = int((float(times_s.max()) - first_s) / SLOT_S) + 1
         motion = SweepMotion(
             first_s, np.tile(self._twist[:3], (slots, 1)), np.tile(self._twist[3:], (slots, 1))
         )
-        return planar_patches(scan.points_lidar, self._sigma_range_m, times_s, motion)
+        return planar_patches(scan.points_lidar, self._noise, times_s, motion)
 
     def _insert(self, pose: gtsam.Pose3, patches: ScanPatches) -> None:
         R, t = _sweep(patches.time_s, self._twist)

@@ -20,6 +20,7 @@ from caliv_graph.common.sorting import stable_order
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.channels import ChannelSums, PointChannels
 from caliv_graph.structure.patches import Swept, scatter_of_ranges
+from caliv_graph.structure.range_noise import RangeNoise
 
 PATCH_M = 0.5
 """Width of a patch across the beams: below the cells of 1 to 2 m over which real walls are uneven,
@@ -159,7 +160,7 @@ class SweepMotion:
 
 def planar_patches(
     points: Array,
-    sigma_range_m: float,
+    noise: RangeNoise,
     times_s: Array | None = None,
     motion: SweepMotion | None = None,
     by_channel: bool = False,
@@ -168,7 +169,7 @@ def planar_patches(
 
     Args:
         points: (N, 3) metres, lidar frame, as measured, without the origin.
-        sigma_range_m: noise along the beam, 1 sigma.
+        noise: along the beam.
         times_s: (N,) seconds after the stamp; None: all at the stamp.
         motion: of the LiDAR, over the span of these times; given with them.
         by_channel: whether what the points of each channel add is kept, where it has channels.
@@ -192,7 +193,7 @@ def planar_patches(
         some = left[chosen]
         at, times = by_axis.take(some, axis=1), None if times_s is None else times_s[some]
         own, number = channels and channels.only(some), groups.count[enough]
-        patches, decided = _judged(number, at, times, motion, slot[some], sigma_range_m, own)
+        patches, decided = _judged(number, at, times, motion, slot[some], noise, own)
         judged = np.zeros(len(left), dtype=bool)
         judged[chosen] = np.repeat(decided, number)
         found.append(patches)
@@ -284,7 +285,7 @@ def _judged(
     times_s: Array | None,
     motion: SweepMotion | None,
     slot: IntArray,
-    sigma_range_m: float,
+    noise: RangeNoise,
     channels: PointChannels | None,
 ) -> tuple[ScanPatches, BoolArray]:
     """Patches among groups; and (n,) whether each group is decided, flat or not.
@@ -316,12 +317,13 @@ def _judged(
     normal = np.where((np.einsum("ni,ni->n", normal, centre) > 0.0)[:, None], -normal, normal)
     range_m = np.sqrt(np.einsum("ni,ni->n", centre, centre))
     cosine = -np.einsum("ni,ni->n", normal, centre) / range_m
-    expected = np.hypot(sigma_range_m * cosine, ROUGHNESS_M)
+    of_range = noise.at(range_m) * cosine
+    expected = np.hypot(of_range, ROUGHNESS_M)
     # Three degrees of freedom went into the plane.
     scatter = width[:, 0] * np.sqrt(count / (count - 3.0))
     flat = scatter < MAX_SCATTER * expected
     # A thick group may become flat when it is seen as a part of nothing else: it is decided.
-    tilt = np.maximum(scatter, sigma_range_m * cosine) / (width[:, 1] * np.sqrt(count) + 1e-12)
+    tilt = np.maximum(scatter, of_range) / (width[:, 1] * np.sqrt(count) + 1e-12)
     u, ranges = scatter_of_ranges(centre, cov, count)
     along = ranges[:, None] * np.abs(np.einsum("ni,nik->nk", u, axes[:, :, 1:]))
     thick = np.maximum(np.maximum(scatter, 1e-6)[:, None], along)

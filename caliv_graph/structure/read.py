@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 
 import gtsam
@@ -18,6 +19,7 @@ from caliv_graph.structure.channels import ChannelSums
 from caliv_graph.structure.noise import roughness_m
 from caliv_graph.structure.patches import DrivePatches, Swept
 from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
+from caliv_graph.structure.range_noise import OPEN_M, RangeNoise, measured_noise
 from caliv_graph.targets.cloud.views import evenly_spread
 from caliv_graph.trajectory.deskew import checked_times
 from caliv_graph.trajectory.imu import log_so3
@@ -69,6 +71,10 @@ its bumps and the noise of its points turn alike in every scan. A rosette at the
 with a tenth of what it sees of the ground (`slalom` of the second simulator: S2S pitch 0.7 and 0.9
 mrad off at a claimed 0.2); other LiDARs have 18 to 140."""
 
+OF_SCANS, LEAST_NOISE_SCANS = 20, 5
+"""Every so many scans one is read first, to measure the noise along the beam, and as many at least.
+They are spread over the drive: beside a hedge nothing is smooth."""
+
 STEEP_COS = float(np.cos(np.radians(74.0)))
 """Cosine of the incidence that counts as no grazing angle: a degree, by which guesses and ground
 may be off, above that of sightings (`config.range_errors.GRAZING_COS`)."""
@@ -103,18 +109,18 @@ def read_patches(
         for drive, recording in enumerate(recordings):
             scans: list[tuple[int, int, ScanPatches]] = []
             for k, name in enumerate(names):
-                stamps = frozenset(wanted[drive][k].tolist())
-                reduced = partial(
-                    _stamped_patches,
-                    T_vehicle_lidar=guesses[k],
-                    trajectory=trajectories[drive],
-                    sigma_range_m=config.noise.lidar_range_m,
-                    keep_level=keep_level,
+                if not len(wanted[drive][k]):
+                    continue
+                cut = partial(
+                    scan_patches, T_vehicle_lidar=guesses[k], trajectory=trajectories[drive]
                 )
-                clouds = recording.scans(name, stamps) if stamps else ()
+                clouds, noise = _with_noise(recording, name, wanted[drive][k], cut, config)
+                reduced = partial(_stamped, partial(cut, noise=noise, keep_level=keep_level))
+                own: list[tuple[int, int, ScanPatches]] = []
                 for stamp_ns, patches in worked_together(reduced, clouds):
-                    scans.append((k, stamp_ns, patches))
+                    own.append((k, stamp_ns, patches))
                     advance()
+                scans.extend(sorted(own, key=lambda scan: scan[1]))
             found.append(_together(drive, names, scans, guesses))
     return tuple(found)
 
@@ -243,23 +249,44 @@ def _motion(instants_ns: IntArray, trajectory: VehicleTrajectory) -> Array:
     return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)))
 
 
-def _stamped_patches(
-    scan: LidarScan,
-    T_vehicle_lidar: gtsam.Pose3,
-    trajectory: VehicleTrajectory,
-    sigma_range_m: float,
-    keep_level: bool,
-) -> tuple[int, ScanPatches]:
-    """The stamp of a scan in nanoseconds, and `scan_patches`."""
-    patches = scan_patches(scan, T_vehicle_lidar, trajectory, sigma_range_m, keep_level)
-    return scan.stamp_ns, patches
+def _with_noise(
+    recording: Recording,
+    name: str,
+    stamps_ns: IntArray,
+    cut: Callable[..., ScanPatches],
+    config: Config,
+) -> tuple[Iterator[LidarScan], RangeNoise]:
+    """The scans of a LiDAR, each read once, and its noise along the beam.
+
+    The noise is that in some of them, which come first and are kept until it is known. `cut` gives
+    the patches of a scan.
+
+    Raises:
+        RecordingError: a cloud could not be read.
+        TrajectoryError: times of points are invalid.
+    """
+    number = min(max(len(stamps_ns) // OF_SCANS, LEAST_NOISE_SCANS), len(stamps_ns))
+    chosen = stamps_ns[np.linspace(0, len(stamps_ns) - 1, number).astype(np.int64)]
+    some = frozenset(chosen.tolist())
+    first = list(recording.scans(name, some))
+    freely = partial(cut, noise=RangeNoise.constant(OPEN_M), keep_level=True)
+    found = list(worked_together(freely, first))
+    stated_m = config.noise.lidar_range_m
+    noise = measured_noise([p.moments for p in found], [p.normal_lidar for p in found], stated_m)
+    rest = recording.scans(name, frozenset(stamps_ns.tolist()) - some)
+    return itertools.chain(first, rest), noise
+
+
+def _stamped(cut: Callable[[LidarScan], ScanPatches], scan: LidarScan) -> tuple[int, ScanPatches]:
+    """The stamp of a scan in nanoseconds, and its patches."""
+    return scan.stamp_ns, cut(scan)
 
 
 def scan_patches(
     scan: LidarScan,
     T_vehicle_lidar: gtsam.Pose3,
     trajectory: VehicleTrajectory,
-    sigma_range_m: float,
+    noise: RangeNoise,
     keep_level: bool = False,
 ) -> ScanPatches:
     """The patches of one scan as it was read, which the guess is good enough for.
@@ -272,7 +299,7 @@ def scan_patches(
     motion = None
     if times_s is not None:
         motion = _sweep_motion(scan.stamp_ns, times_s, T_vehicle_lidar, trajectory)
-    patches = planar_patches(scan.points_lidar, sigma_range_m, times_s, motion, by_channel=True)
+    patches = planar_patches(scan.points_lidar, noise, times_s, motion, by_channel=True)
     begin, end = trajectory.span_ns
     at = scan.stamp_ns + np.round(patches.time_s * NANOSECONDS_PER_SECOND).astype(np.int64)
     keep: BoolArray = (at >= begin) & (at <= end)

@@ -128,6 +128,8 @@ def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> Ve
             float(np.sqrt(((y - A @ found) ** 2).mean())) if len(y) else 0.0 for A, y in groups
         ]
         sigmas = np.maximum(spread, least)
+        # Slopes across the path vary as those along it: beside a hill all of them are to one side.
+        sigmas[3] = max(sigmas[3], sigmas[1])
     cov = np.linalg.pinv(information)[:2, :2]
     cov = cov + _attitude_cov(trajectory)
     body = body_sigma_rad(config)

@@ -20,6 +20,7 @@ from caliv_graph.structure.align import PatchAlignment, _jacobians, align_patche
 from caliv_graph.structure.pairs import Pairs, gathered
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
+from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.structure.read import _together, level, lidars_above_ground, scan_patches
 from caliv_graph.structure.solve import solve_structure
 from caliv_graph.structure.term import problem_of, term_of, usable
@@ -27,6 +28,8 @@ from caliv_graph.trajectory.select import GivenTrajectory
 from tests.samples import pose
 from tests.structure.worlds import Spinner, World, driven, ground, world_of, yard
 from tests.trajectory.motions import eight_drive
+
+NOISE = RangeNoise.constant(0.01)
 
 TRAJECTORY = driven(eight_drive())
 SPINNERS = {
@@ -58,7 +61,7 @@ def patches_of(world: World, stamps_s: Array, seed: int = 1) -> DrivePatches:
     for k, (name, spinner) in enumerate(SPINNERS.items()):
         for stamp in np.round(1e9 * stamps_s).astype(np.int64).tolist():
             scan = spinner.scan(name, world, TRAJECTORY, stamp + 30_000_000 * k, rng)
-            found = scan_patches(scan, TRUTH[name], TRAJECTORY, 0.01, keep_level=True)
+            found = scan_patches(scan, TRUTH[name], TRAJECTORY, NOISE, keep_level=True)
             scans.append((k, scan.stamp_ns, found))
     return _together(0, tuple(SPINNERS), scans, tuple(TRUTH.values()))
 

@@ -15,8 +15,11 @@ from caliv_graph.structure.channels import (
     found_channels,
 )
 from caliv_graph.structure.planar import ScanPatches, SweepMotion, planar_patches
+from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.targets.cloud.beams import elevations
 from tests.structure.test_planar import beams, on_plane
+
+NOISE = RangeNoise.constant(0.01)
 
 UNEVEN_DEG = np.concatenate([np.arange(-25.0, -8.0, 1.7), np.arange(-7.0, 4.0, 0.33), [5.0, 9.0]])
 
@@ -90,8 +93,8 @@ WALL = RAYS * on_plane(RAYS, np.array([0.9, 0.3, 0.1]), 12.0)[:, None]
 def test_what_the_channels_add_is_what_the_patch_has() -> None:
     times = np.linspace(0.0, 0.1, len(WALL))
     motion = SweepMotion(0.0, np.tile([0.0, 0.1, 0.4], (11, 1)), np.tile([3.0, 0.2, 0.0], (11, 1)))
-    at_once = planar_patches(WALL, 0.01, by_channel=True)
-    for found in (at_once, planar_patches(WALL, 0.01, times, motion, by_channel=True)):
+    at_once = planar_patches(WALL, NOISE, by_channel=True)
+    for found in (at_once, planar_patches(WALL, NOISE, times, motion, by_channel=True)):
         channels = found.channels
         assert channels is not None
         total = np.zeros((len(found.time_s), 4))
@@ -101,7 +104,7 @@ def test_what_the_channels_add_is_what_the_patch_has() -> None:
         # Within 5 ms points moved by 15 mm at most.
         seen = elevations(channels.sums[:, :3])
         assert np.abs(seen - channels.elevation_rad).max() < np.radians(0.15)
-    assert planar_patches(WALL, 0.01).channels is None
+    assert planar_patches(WALL, NOISE).channels is None
 
 
 def by_patch(channels: ChannelSums, patch: int) -> Array:
@@ -110,7 +113,7 @@ def by_patch(channels: ChannelSums, patch: int) -> Array:
 
 
 def test_some_of_the_patches_keep_their_own() -> None:
-    found = planar_patches(WALL, 0.01, by_channel=True)
+    found = planar_patches(WALL, NOISE, by_channel=True)
     assert found.channels is not None
     for keep in (np.array([3, 7, 20]), np.isin(np.arange(len(found.time_s)), [3, 7, 20])):
         some = found.part(keep).channels
@@ -121,7 +124,7 @@ def test_some_of_the_patches_keep_their_own() -> None:
 
 
 def test_scans_without_channels_are_joined_with_others() -> None:
-    found = planar_patches(WALL, 0.01, by_channel=True)
+    found = planar_patches(WALL, NOISE, by_channel=True)
     none: ScanPatches = replace(found, channels=None)
     count = len(found.time_s)
     joined = ChannelSums.joined([none.channels, found.channels], [count, count])
@@ -137,17 +140,17 @@ def test_two_rings_on_either_side_of_a_kerb_are_no_patch() -> None:
     rays = beams(np.array([-25.0, -22.9]), np.arange(-180.0, 180.0, 0.2))
     height = np.where(rays[:, 2] < np.sin(np.radians(-24.0)), 1.80, 1.77)
     points = rays * (height / -rays[:, 2])[:, None]
-    taken = planar_patches(points, 0.01)
+    taken = planar_patches(points, NOISE)
     assert len(taken.time_s) > 10
     assert taken.normal_lidar[:, 2].max() < np.cos(np.radians(5.0))
-    assert not len(planar_patches(points, 0.01, by_channel=True).time_s)
+    assert not len(planar_patches(points, NOISE, by_channel=True).time_s)
 
 
 def test_two_rings_are_a_patch_where_no_third_is_near() -> None:
     """Ground 8 m before a LiDAR of 16 channels, whose rings are more than a metre apart."""
     rays = beams(np.array([-14.4, -12.2]), np.arange(-180.0, 180.0, 0.2))
     points = rays * (1.8 / -rays[:, 2])[:, None]
-    taken = planar_patches(points, 0.01)
+    taken = planar_patches(points, NOISE)
     assert len(taken.time_s) > 5
-    by_channel = planar_patches(points, 0.01, by_channel=True)
+    by_channel = planar_patches(points, NOISE, by_channel=True)
     np.testing.assert_array_equal(by_channel.moments, taken.moments)

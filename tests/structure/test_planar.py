@@ -15,8 +15,11 @@ from caliv_graph.structure.planar import (
     SweepMotion,
     planar_patches,
 )
+from caliv_graph.structure.range_noise import RangeNoise
 
 SIGMA_M = 0.01
+
+NOISE = RangeNoise.constant(SIGMA_M)
 
 
 def beams(elevations_deg: Array, azimuths_deg: Array) -> Array:
@@ -70,7 +73,7 @@ def test_the_moments_are_the_sums_over_the_points() -> None:
     # All within one cell of 3.75 degrees.
     rays = beams(np.arange(0.2, 3.4, 0.25), np.arange(0.2, 3.4, 0.25))
     points = noisy(rays, on_plane(rays, np.array([1.0, 0.0, 0.0]), 9.0))
-    patches = planar_patches(points, SIGMA_M)
+    patches = planar_patches(points, NOISE)
     h = np.column_stack([points, np.ones(len(points))])
     np.testing.assert_allclose(patches.moments, [h.T @ h], rtol=1e-12)
     np.testing.assert_allclose(patches.normal_lidar, [[-1.0, 0.0, 0.0]], atol=0.02)
@@ -83,7 +86,7 @@ def test_a_wall_becomes_unbiased_patches() -> None:
     normal = np.array([0.8, 0.5, 0.1])
     normal /= np.linalg.norm(normal)
     points = noisy(DENSE, on_plane(DENSE, normal, 15.0))
-    patches = planar_patches(points, SIGMA_M)
+    patches = planar_patches(points, NOISE)
     assert points_of(patches).sum() > 0.95 * (len(points) - patches.grazing)
     assert patches.uneven == 0
     assert points_of(patches).min() >= MIN_POINTS
@@ -103,7 +106,7 @@ def test_no_patch_is_a_mean_of_the_two_walls_of_a_corner() -> None:
     normals = np.array([[0.9, 0.436, 0.0], [0.7, -0.714, 0.0]])
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     ranges = np.minimum(*(on_plane(DENSE, n, 11.0) for n in normals))
-    patches = planar_patches(noisy(DENSE, ranges), SIGMA_M)
+    patches = planar_patches(noisy(DENSE, ranges), NOISE)
     angle = np.arccos(np.clip(np.abs(patches.normal_lidar @ normals.T), 0.0, 1.0)).min(axis=1)
     assert len(angle) > 300
     assert angle.max() < 0.12
@@ -117,7 +120,7 @@ def test_no_patch_spans_a_step(step_m: float) -> None:
     left = np.arctan2(DENSE[:, 1], DENSE[:, 0]) > np.radians(8.2)
     normal = np.array([1.0, 0.0, 0.0])
     ranges = np.where(left, on_plane(DENSE, normal, 10.0), on_plane(DENSE, normal, 10.0 + step_m))
-    patches = planar_patches(noisy(DENSE, ranges), SIGMA_M)
+    patches = planar_patches(noisy(DENSE, ranges), NOISE)
     x = centres(patches)[:, 0]
     assert len(x) > 300
     off = np.minimum(np.abs(x - 10.0), np.abs(x - 10.0 - step_m))
@@ -133,7 +136,7 @@ def beside_a_kerb(kerb_m: float, seed: int) -> ScanPatches:
     at_face = kerb_m / x
     ranges = np.where(z * at_face > -2.0, at_face, ranges)
     ranges = np.where(z * at_face > -1.88, -1.88 / z, ranges)
-    return planar_patches(noisy(rays, ranges, seed), SIGMA_M)
+    return planar_patches(noisy(rays, ranges, seed), NOISE)
 
 
 @pytest.mark.parametrize("width_deg", [0.5, 1.0])
@@ -142,8 +145,8 @@ def test_a_line_of_points_that_noise_makes_wide_is_no_plane(width_deg: float) ->
 
     As a patch it would be tilted by 7 and 3 degrees: its width is that of the noise.
     """
-    assert not len(planar_patches(arc_on_ground(width_deg), SIGMA_M).time_s)
-    wide = planar_patches(arc_on_ground(4.0), SIGMA_M)
+    assert not len(planar_patches(arc_on_ground(width_deg), NOISE).time_s)
+    wide = planar_patches(arc_on_ground(4.0), NOISE)
     assert len(wide.time_s)
     assert (wide.normal_lidar[:, 2] > np.cos(np.radians(2.0))).all()
 
@@ -179,18 +182,18 @@ def test_curved_and_rough_surfaces_are_left_out() -> None:
     with np.errstate(invalid="ignore"):
         ball = b - np.sqrt(b * b - 64.0 + 0.5**2)
     ball = np.where(np.isfinite(ball), ball, np.inf)
-    patches = planar_patches(noisy(rays, ball), SIGMA_M)
+    patches = planar_patches(noisy(rays, ball), NOISE)
     assert points_of(patches).sum() < 0.1 * np.isfinite(ball).sum()
     hedge = on_plane(DENSE, np.array([1.0, 0.0, 0.0]), 9.0)
     hedge += np.random.default_rng(1).normal(0.0, 0.05, len(hedge))
-    patches = planar_patches(noisy(DENSE, hedge), SIGMA_M)
+    patches = planar_patches(noisy(DENSE, hedge), NOISE)
     assert points_of(patches).sum() < 0.01 * len(DENSE)
     assert patches.uneven > 0.9 * len(DENSE)
 
 
 def test_beams_that_graze_a_wall_are_left_out() -> None:
     normal = np.array([np.sin(np.radians(3.0)), np.cos(np.radians(3.0)), 0.0])
-    patches = planar_patches(noisy(DENSE, on_plane(DENSE, normal, 2.0)), SIGMA_M)
+    patches = planar_patches(noisy(DENSE, on_plane(DENSE, normal, 2.0)), NOISE)
     towards = centres(patches) / np.linalg.norm(centres(patches), axis=1)[:, None]
     cosine = -np.einsum("ni,ni->n", towards, patches.normal_lidar)
     assert cosine.min() > np.cos(np.radians(75.0))
@@ -202,11 +205,11 @@ def test_two_rings_prove_no_plane_and_sixteen_do() -> None:
     normal = np.array([0.9, 0.3, 0.0])
     normal /= np.linalg.norm(normal)
     two = beams(np.array([-1.0, 1.0]), azimuths)
-    assert not len(planar_patches(noisy(two, on_plane(two, normal, 10.0)), SIGMA_M).time_s)
+    assert not len(planar_patches(noisy(two, on_plane(two, normal, 10.0)), NOISE).time_s)
     # A ring on a wall and one on the ground before it lie on a plane, which is neither.
     rings = beams(np.linspace(-15.0, 15.0, 16), azimuths)
     ranges = np.minimum(on_plane(rings, normal, 12.0), on_plane(rings, np.array([0, 0, -1.0]), 1.6))
-    patches = planar_patches(noisy(rings, ranges), SIGMA_M)
+    patches = planar_patches(noisy(rings, ranges), NOISE)
     assert len(patches.time_s) > 20
     upright = np.abs(patches.normal_lidar[:, 2]) < 0.3
     assert upright.sum() > 20
@@ -218,7 +221,7 @@ def test_the_cells_favour_no_axis() -> None:
     normal = np.array([0.8, 0.5, 0.3])
     normal /= np.linalg.norm(normal)
     points = noisy(DENSE, on_plane(DENSE, normal, 9.0))
-    here, there = planar_patches(points, SIGMA_M), planar_patches(points[:, [1, 2, 0]], SIGMA_M)
+    here, there = planar_patches(points, NOISE), planar_patches(points[:, [1, 2, 0]], NOISE)
     assert len(here.time_s) == len(there.time_s)
     back = there.moments[:, [2, 0, 1, 3]][:, :, [2, 0, 1, 3]]
     order, other = (np.lexsort(m[:, :3, 3].T.round(6)) for m in (here.moments, back))
@@ -228,7 +231,7 @@ def test_the_cells_favour_no_axis() -> None:
 def test_the_order_of_the_points_does_not_matter() -> None:
     points = noisy(DENSE, on_plane(DENSE, np.array([1.0, 0.0, 0.0]), 9.0))
     mixed = np.random.default_rng(2).permutation(len(points))
-    here, there = planar_patches(points, SIGMA_M), planar_patches(points[mixed], SIGMA_M)
+    here, there = planar_patches(points, NOISE), planar_patches(points[mixed], NOISE)
     np.testing.assert_allclose(there.moments, here.moments, rtol=1e-9, atol=1e-9)
 
 
@@ -248,13 +251,13 @@ def test_points_of_a_sweep_are_moved_to_their_patchs_time() -> None:
     n, d = plane_at(times)
     points = DENSE * (d / np.einsum("ni,ni->n", DENSE, n))[:, None]
     motion = SweepMotion(0.0, np.tile(turn, (11, 1)), np.tile(velocity, (11, 1)))
-    patches = planar_patches(points, SIGMA_M, times, motion)
+    patches = planar_patches(points, NOISE, times, motion)
     n, d = plane_at(patches.time_s)
     off = np.einsum("ni,ni->n", centres(patches), n) - d
     assert len(off) > 100
     assert np.abs(off).max() < 2e-4
     assert patches.scatter_m.max() < 2e-4
-    still = planar_patches(points, SIGMA_M)
+    still = planar_patches(points, NOISE)
     assert still.scatter_m.max() > 5e-3 or len(still.time_s) < len(patches.time_s)
 
 
@@ -262,14 +265,14 @@ def test_a_dense_cloud_costs_no_more_than_a_bounded_one() -> None:
     rays = beams(np.arange(-45.0, 45.0, 0.1), np.arange(-45.0, 45.0, 0.22))
     assert len(rays) > 300_000
     points = noisy(rays, on_plane(rays, np.array([1.0, 0.0, 0.0]), 25.0))
-    patches = planar_patches(points, SIGMA_M)
+    patches = planar_patches(points, NOISE)
     assert 1000 < len(patches.time_s) <= MAX_PATCHES
     assert np.ptp(centres(patches)[:, 1]) > 40.0
 
 
 def test_nothing_comes_of_nothing() -> None:
     for points in (np.zeros((0, 3)), np.array([[5.0, 0.0, 0.0]])):
-        patches = planar_patches(points, SIGMA_M)
+        patches = planar_patches(points, NOISE)
         assert len(patches.time_s) == 0
         assert patches.moments.shape == (0, 4, 4)
         assert patches.undecided == len(points)
@@ -287,7 +290,7 @@ def test_patches_of_a_sweep_follow_better_extrinsics() -> None:
     def taken(T_vehicle_lidar: gtsam.Pose3) -> DrivePatches:
         twist = T_vehicle_lidar.inverse().AdjointMap() @ of_vehicle
         motion = SweepMotion(0.0, np.tile(twist[:3], (11, 1)), np.tile(twist[3:], (11, 1)))
-        found = planar_patches(points, SIGMA_M, times, motion)
+        found = planar_patches(points, NOISE, times, motion)
         return of_one_scan(found, T_vehicle_lidar)
 
     def tilts(patches: DrivePatches) -> Array:
@@ -314,7 +317,7 @@ def test_patches_of_a_sweep_follow_better_extrinsics() -> None:
 
 
 def test_patches_that_were_taken_at_once_follow_nothing() -> None:
-    found = planar_patches(DENSE * on_plane(DENSE, np.array([1.0, 0.0, 0.0]), 8.0)[:, None], 0.01)
+    found = planar_patches(DENSE * on_plane(DENSE, np.array([1.0, 0.0, 0.0]), 8.0)[:, None], NOISE)
     assert found.swept is None
 
 
@@ -330,7 +333,7 @@ def test_noise_along_the_beams_is_taken_out_of_the_tilt_of_ground() -> None:
     flat = np.cos(down)
     rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), -np.sin(down)], axis=1)
     ranges = height_m / np.sin(down) + rng.normal(0.0, sigma_m, len(down))
-    found = planar_patches(rays * ranges[:, None], 0.01)
+    found = planar_patches(rays * ranges[:, None], NOISE)
     of = of_one_scan(found)
     along = of.scatter_along_beam_m
 

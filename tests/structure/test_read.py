@@ -17,6 +17,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, LidarScan, Trajectory
 from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.structure.read import (
     MAX_POSES,
     MAX_SCANS,
@@ -30,6 +31,8 @@ from tests.drives_with_chair import Memory
 from tests.samples import pose
 from tests.structure.worlds import Spinner, World, driven, recorded, yard
 from tests.trajectory.motions import eight_drive
+
+NOISE = RangeNoise.constant(0.01)
 
 TRAJECTORY = driven(eight_drive())
 SPINNERS = {
@@ -191,7 +194,7 @@ def test_a_drive_without_scans_has_no_patches() -> None:
 def test_a_time_that_no_sweep_has_is_an_error() -> None:
     scan = LidarScan("front", SECOND_NS, np.ones((2, 3)), "a scan", np.array([0.0, 1e9]))
     with pytest.raises(TrajectoryError, match="a scan: per-point times"):
-        scan_patches(scan, gtsam.Pose3(), TRAJECTORY, 0.01)
+        scan_patches(scan, gtsam.Pose3(), TRAJECTORY, NOISE)
 
 
 def test_patches_from_outside_the_trajectory_are_left_out() -> None:
@@ -199,6 +202,6 @@ def test_patches_from_outside_the_trajectory_are_left_out() -> None:
     _, end = TRAJECTORY.span_ns
     longer = driven(eight_drive(62.0))
     scan = spinner.scan("top", yard(), longer, end - 50_000_000, np.random.default_rng(0))
-    patches = scan_patches(scan, spinner.T_vehicle_lidar, TRAJECTORY, 0.01, keep_level=True)
+    patches = scan_patches(scan, spinner.T_vehicle_lidar, TRAJECTORY, NOISE, keep_level=True)
     assert len(patches.time_s) > 20
     assert 0.03 < patches.time_s.max() <= 0.05

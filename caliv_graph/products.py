@@ -289,6 +289,8 @@ class TargetObservation:
         clouds: in order of LiDAR, then stamp; of many scans that see it, evenly chosen ones.
         warnings: what was left out, and why, a line each.
         seen_ns: LiDAR -> stamps of all scans that were found to see it, ascending.
+        range_noise_m: LiDAR -> noise along the beam at the target's distance, 1 sigma, as surfaces
+            around tell it; none: as it is configured.
     """
 
     placement: int
@@ -297,6 +299,7 @@ class TargetObservation:
     clouds: tuple[TargetCloud, ...]
     warnings: tuple[str, ...] = ()
     seen_ns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    range_noise_m: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from caliv_graph.mounting.sharpness import (
 )
 from caliv_graph.mounting.upright import Ground, ground_below
 from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
+from caliv_graph.structure.patches import RangeNoise
 from caliv_graph.structure.planar import ScanPatches, planar_patches
-from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.targets.ground.surface import HALF_SIZE_M, fit_surface
 from caliv_graph.targets.search.find import scans_to_read
 from caliv_graph.trajectory.deskew import checked_times

@@ -15,8 +15,8 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import cross
 from caliv_graph.odometry.surface_map import SurfaceMap, point_to_plane
 from caliv_graph.products import Array, IntArray, LidarScan
+from caliv_graph.structure.patches import RangeNoise
 from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
-from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.structure.sightings import moved_moments
 from caliv_graph.trajectory.deskew import checked_times
 from caliv_graph.trajectory.imu import exp_so3

@@ -41,6 +41,7 @@ from caliv_graph.readers.empty import CountedRecording
 from caliv_graph.readers.pose_pauses import without_pauses
 from caliv_graph.structure.own_body import without_own_body
 from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.range_noise import with_range_noise
 from caliv_graph.structure.read import ground_roughness_m, read_patches
 from caliv_graph.structure.without_targets import without_targets
 from caliv_graph.targets.cloud.extract import extract_targets
@@ -164,6 +165,7 @@ def prepare(
     patches, of_body = _without_own_body(
         _patches(recordings, rough, config, progress), rough, config
     )
+    observations = tuple(with_range_noise(o, patches) for o in observations)
     patches = tuple(without_targets(p, observations, rough[p.drive], config) for p in patches)
     config, on_grass = _on_rough_ground(config, recordings, patches, rough)
     kept = kept_stamps(patches, usable(observations))

@@ -75,7 +75,7 @@ class CloudStack:
         flatness: (N,) reliability of the normal, 0 to 1. It is 0 where the neighbourhood is sparse
             or noisy; there the normal is the direction to the sensor.
         whole: J clouds before thinning, for the normals.
-        sigma_range_m: noise along the beams, 1 sigma, metres.
+        sigma_range_m: (L,) noise along the beams of each LiDAR, 1 sigma, metres.
     """
 
     points: Array
@@ -86,7 +86,7 @@ class CloudStack:
     normals: Array
     flatness: Array
     whole: tuple[Array, ...]
-    sigma_range_m: float
+    sigma_range_m: Array
 
     def points_of(self, which: IntArray) -> IntArray:
         """Indices of the points of these clouds, one cloud after the other."""
@@ -211,22 +211,27 @@ def surface_normals(
 
 
 def stack_clouds(
-    observation: TargetObservation, max_points: int, sigma_range_m: float, normals: bool = True
+    observation: TargetObservation,
+    max_points: int,
+    sigma_range_m: Array | float,
+    normals: bool = True,
 ) -> CloudStack:
     """Stacks the clouds of a placement, none of them empty.
 
     Clouds of more than `max_points` points are thinned (`sampling_order`). Without `normals`, if
-    `merged_normals` follows, all normals point to the sensor. The noise along the beam is in
-    metres.
+    `merged_normals` follows, all normals point to the sensor. The noise along the beam, of each
+    LiDAR (L,) or of all, is in metres.
     """
     points, normal, flatness = [], [], []
-    for cloud in observation.clouds:
+    lidar = _indices([cloud.lidar for cloud in observation.clouds])
+    sigmas = np.full(int(lidar.max()) + 1, sigma_range_m)
+    for cloud, sigma_m in zip(observation.clouds, sigmas[lidar].tolist(), strict=True):
         kept = cloud.points_lidar
         if len(kept) > max_points:
             kept = kept[np.sort(np.argsort(sampling_order(kept))[:max_points])]
         points.append(kept)
         if normals:
-            n, flat = surface_normals(kept, sigma_range_m, cloud.points_lidar)
+            n, flat = surface_normals(kept, sigma_m, cloud.points_lidar)
         else:
             n, flat = np.zeros_like(kept), np.zeros(len(kept))
         normal.append(n)
@@ -239,12 +244,12 @@ def stack_clouds(
         points=stacked,
         cloud=np.repeat(np.arange(len(points)), sizes),
         starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
-        lidar=_indices([cloud.lidar for cloud in observation.clouds]),
+        lidar=lidar,
         beams=beams,
         normals=_towards_sensor(np.concatenate(normal), flat, beams),
         flatness=flat,
         whole=tuple(cloud.points_lidar for cloud in observation.clouds),
-        sigma_range_m=sigma_range_m,
+        sigma_range_m=sigmas,
     )
 
 
@@ -285,7 +290,7 @@ def merged_normals(stack: CloudStack, R: Array, t: Array) -> CloudStack:
             beams[own],
             MERGED_NEIGHBOURS,
             MERGED_RADIUS_M,
-            stack.sigma_range_m,
+            float(stack.sigma_range_m[lidar[j]]),
             MERGED_WIDEST_M,
         )
 

@@ -25,7 +25,7 @@ spots of few beams do not show what they miss between these. Measured on the fac
 repeated scans of two OS1-128: 3 to 4.5 mm."""
 
 PRIOR_POINTS = 50.0
-"""Points that the configured noise of the range counts as when it is estimated."""
+"""Points that the noise of the range as it is known before counts as when it is estimated."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class HeightNoise:
     floor_m: float
 
     @classmethod
-    def configured(cls, lidars: int, sigma_range_m: float, floor_m: float) -> HeightNoise:
-        """The configured noise along the beam, and the smallest roughness."""
-        variance = max(sigma_range_m, LEAST_SIGMA_M) ** 2
-        return cls(np.full(lidars, variance), np.full(lidars, LEAST_SIGMA_M**2), floor_m)
+    def configured(cls, lidars: int, sigma_range_m: Array | float, floor_m: float) -> HeightNoise:
+        """The noise along the beam, of each LiDAR or of all, and the smallest roughness."""
+        variance = np.maximum(np.full(lidars, sigma_range_m), LEAST_SIGMA_M) ** 2
+        return cls(variance, np.full(lidars, LEAST_SIGMA_M**2), floor_m)
 
     def largest_m(self) -> float:
         """The largest standard deviation along a beam, metres."""
@@ -72,7 +72,7 @@ class HeightNoise:
         Args:
             heights: of the E-step.
             parameters: what the shape has taken up, in points.
-            before: configured noise, a prior of `PRIOR_POINTS`.
+            before: the noise as it is known before, a prior of `PRIOR_POINTS`.
         """
         points = heights.points.sum()
         # Heights over planes that were fitted to them are too small; what a point gives to the

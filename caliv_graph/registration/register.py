@@ -147,17 +147,17 @@ class JointRegistration:
             )
         self.observation = observation
         most = config.registration.max_points
+        names = list(dict.fromkeys(cloud.lidar for cloud in observation.clouds))
+        stated_m, told_m = config.noise.lidar_range_m, observation.range_noise_m
+        sigmas_m = np.array([max(stated_m, told_m.get(name, 0.0)) for name in names])
         self.clouds: CloudStack = stack_clouds(
-            observation,
-            min(most, ROUGH_POINTS) if rough else most,
-            config.noise.lidar_range_m,
-            normals,
+            observation, min(most, ROUGH_POINTS) if rough else most, sigmas_m, normals
         )
         self._components = config.registration.components // (2 if rough else 1)
         self._gamma = config.registration.outlier_ratio
         self._guess_sigmas = {name: stated_sigmas(of) for name, of in config.lidars.items()}
         self.tolerance = ROUGH_TOLERANCE if rough else STEP_TOLERANCE
-        self._floor_end = FLOOR_PER_RANGE_SIGMA * config.noise.lidar_range_m
+        self._floor_end = FLOOR_PER_RANGE_SIGMA * float(sigmas_m.min())
         self._floor = COARSE_SIGMA_M
         self._depth_m = 1.0
         self._mixture: Mixture | None = None
@@ -167,7 +167,7 @@ class JointRegistration:
         self.inlier_ratio: Array = np.ones(self.clouds.count)
         self._views = np.ones(self.clouds.count) if views is None else views
         self.noise = self._configured = HeightNoise.configured(
-            self.clouds.lidars, config.noise.lidar_range_m, self._floor
+            self.clouds.lidars, sigmas_m, self._floor
         )
         # Until the noise is known, as much is taken to be shared as is typical.
         self._shared = np.full(self.clouds.lidars, TYPICAL_SHARED)

@@ -7,7 +7,7 @@ sufficient for every later use, at any pose (`README.md`, section 2), so that no
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
@@ -54,6 +54,28 @@ class Swept:
         )
 
 
+@dataclass(frozen=True)
+class RangeNoise:
+    """Noise along the beam, 1 sigma, linear in between, constant beyond both ends.
+
+    Attributes:
+        distances_m: (k,) ascending.
+        sigmas_m: (k,) there.
+    """
+
+    distances_m: Array
+    sigmas_m: Array
+
+    @classmethod
+    def constant(cls, sigma_m: float) -> RangeNoise:
+        """The same at all distances."""
+        return cls(np.ones(1), np.full(1, sigma_m))
+
+    def at(self, distance_m: Array) -> Array:
+        """(n,) 1 sigma in metres at these distances (n,)."""
+        return np.asarray(np.interp(distance_m, self.distances_m, self.sigmas_m))
+
+
 SMALLEST_SHAPE_M4 = 1e-12
 """Points within a millimetre of a line across their beams tell no scatter."""
 
@@ -80,6 +102,7 @@ class DrivePatches:
         moved_with: of each LiDAR the T_vehicle_lidar that this was done with.
         channels: what the points of each channel add; None: no LiDAR has channels. They are
             multiplied by errors of millimetres, so that they follow no extrinsics.
+        noise: of the LiDARs whose scans were read, by their index in `lidars`.
     """
 
     drive: int
@@ -94,6 +117,7 @@ class DrivePatches:
     swept: Swept | None = None
     moved_with: tuple[gtsam.Pose3, ...] = ()
     channels: ChannelSums | None = None
+    noise: Mapping[int, RangeNoise] = field(default_factory=dict)
 
     def part(self, keep: BoolArray) -> DrivePatches:
         """Some of the patches (N,), of the same scans."""

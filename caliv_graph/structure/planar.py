@@ -19,8 +19,7 @@ import numpy as np
 from caliv_graph.common.sorting import stable_order
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.channels import ChannelSums, PointChannels
-from caliv_graph.structure.patches import Swept, scatter_of_ranges
-from caliv_graph.structure.range_noise import RangeNoise
+from caliv_graph.structure.patches import RangeNoise, Swept, scatter_of_ranges
 
 PATCH_M = 0.5
 """Width of a patch across the beams: below the cells of 1 to 2 m over which real walls are uneven,

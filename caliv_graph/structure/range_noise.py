@@ -7,12 +7,12 @@ the usual 10 mm their walls are not flat, and those few patches that pass preten
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
-from caliv_graph.products import Array
-from caliv_graph.structure.patches import scatter_of_ranges
+from caliv_graph.products import Array, TargetObservation
+from caliv_graph.structure.patches import DrivePatches, RangeNoise, scatter_of_ranges
 
 OPEN_M = 0.06
 """Noise that patches may have when it is measured, 1 sigma: no LiDAR for vehicles has more at the
@@ -30,28 +30,6 @@ STEEP_COS = 0.35
 SMOOTH_SHARE = 0.25
 """Share of the patches that are of smooth surfaces, at least; their quantile is the noise. Others
 are of leaves, which scatter by 30 mm and more of themselves."""
-
-
-@dataclass(frozen=True)
-class RangeNoise:
-    """Noise along the beam, 1 sigma, linear in between, constant beyond both ends.
-
-    Attributes:
-        distances_m: (k,) ascending.
-        sigmas_m: (k,) there.
-    """
-
-    distances_m: Array
-    sigmas_m: Array
-
-    @classmethod
-    def constant(cls, sigma_m: float) -> RangeNoise:
-        """The same at all distances."""
-        return cls(np.ones(1), np.full(1, sigma_m))
-
-    def at(self, distance_m: Array) -> Array:
-        """(n,) 1 sigma in metres at these distances (n,)."""
-        return np.asarray(np.interp(distance_m, self.distances_m, self.sigmas_m))
 
 
 def measured_noise(
@@ -84,3 +62,23 @@ def measured_noise(
     sigmas = np.minimum.accumulate(sigmas[::-1])[::-1]
     sigmas = middles * np.minimum.accumulate(sigmas / middles)
     return RangeNoise(middles, np.maximum(sigmas, stated_m))
+
+
+def with_range_noise(
+    observation: TargetObservation, patches: Sequence[DrivePatches]
+) -> TargetObservation:
+    """The clouds of a target, with the noise of the LiDARs at its distance by the patches around.
+
+    The clouds themselves hardly tell it: a shape of many small surfels takes some of it up.
+    """
+    told: dict[str, float] = {}
+    for name in dict.fromkeys(cloud.lidar for cloud in observation.clouds):
+        for of in patches:
+            noise = of.noise.get(of.lidars.index(name))
+            clouds = [c for c in observation.clouds if (c.lidar, c.drive) == (name, of.drive)]
+            if noise is None or not clouds:
+                continue
+            points = np.concatenate([cloud.points_lidar for cloud in clouds])
+            distance_m = np.median(np.linalg.norm(points, axis=1), keepdims=True)
+            told[name] = float(noise.at(distance_m)[0])
+    return replace(observation, range_noise_m=told)

@@ -17,9 +17,9 @@ from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
 from caliv_graph.structure.channels import ChannelSums
 from caliv_graph.structure.noise import roughness_m
-from caliv_graph.structure.patches import DrivePatches, Swept
+from caliv_graph.structure.patches import DrivePatches, RangeNoise, Swept
 from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
-from caliv_graph.structure.range_noise import OPEN_M, RangeNoise, measured_noise
+from caliv_graph.structure.range_noise import OPEN_M, measured_noise
 from caliv_graph.targets.cloud.views import evenly_spread
 from caliv_graph.trajectory.deskew import checked_times
 from caliv_graph.trajectory.imu import log_so3
@@ -108,20 +108,21 @@ def read_patches(
     with progress.stage("reading walls and other surfaces", total) as advance:
         for drive, recording in enumerate(recordings):
             scans: list[tuple[int, int, ScanPatches]] = []
+            noises: dict[int, RangeNoise] = {}
             for k, name in enumerate(names):
                 if not len(wanted[drive][k]):
                     continue
                 cut = partial(
                     scan_patches, T_vehicle_lidar=guesses[k], trajectory=trajectories[drive]
                 )
-                clouds, noise = _with_noise(recording, name, wanted[drive][k], cut, config)
-                reduced = partial(_stamped, partial(cut, noise=noise, keep_level=keep_level))
+                clouds, noises[k] = _with_noise(recording, name, wanted[drive][k], cut, config)
+                reduced = partial(_stamped, partial(cut, noise=noises[k], keep_level=keep_level))
                 own: list[tuple[int, int, ScanPatches]] = []
                 for stamp_ns, patches in worked_together(reduced, clouds):
                     own.append((k, stamp_ns, patches))
                     advance()
                 scans.extend(sorted(own, key=lambda scan: scan[1]))
-            found.append(_together(drive, names, scans, guesses))
+            found.append(_together(drive, names, scans, guesses, noises))
     return tuple(found)
 
 
@@ -337,8 +338,9 @@ def _together(
     names: tuple[str, ...],
     scans: Sequence[tuple[int, int, ScanPatches]],
     moved_with: tuple[gtsam.Pose3, ...],
+    noises: Mapping[int, RangeNoise],
 ) -> DrivePatches:
-    """The patches of all scans (LiDAR, stamp, patches) of a drive."""
+    """The patches of all scans (LiDAR, stamp, patches) of a drive, and the noise of LiDARs."""
     parts = [patches for _, _, patches in scans]
     number = [len(p.time_s) for p in parts]
     return DrivePatches(
@@ -354,4 +356,5 @@ def _together(
         swept=Swept.joined([p.swept for p in parts], number),
         moved_with=moved_with,
         channels=ChannelSums.joined([p.channels for p in parts], number),
+        noise=noises,
     )

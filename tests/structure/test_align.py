@@ -18,9 +18,8 @@ from caliv_graph.products import Array, IntArray, Trajectory
 from caliv_graph.structure import pairs
 from caliv_graph.structure.align import PatchAlignment, _jacobians, align_patches
 from caliv_graph.structure.pairs import Pairs, gathered
-from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.patches import DrivePatches, RangeNoise
 from caliv_graph.structure.prior import PosePrior
-from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.structure.read import _together, level, lidars_above_ground, scan_patches
 from caliv_graph.structure.solve import solve_structure
 from caliv_graph.structure.term import problem_of, term_of, usable

@@ -14,8 +14,8 @@ from caliv_graph.structure.channels import (
     PointChannels,
     found_channels,
 )
+from caliv_graph.structure.patches import RangeNoise
 from caliv_graph.structure.planar import ScanPatches, SweepMotion, planar_patches
-from caliv_graph.structure.range_noise import RangeNoise
 from caliv_graph.targets.cloud.beams import elevations
 from tests.structure.test_planar import beams, on_plane
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array
-from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.patches import DrivePatches, RangeNoise
 from caliv_graph.structure.planar import (
     MAX_PATCHES,
     MIN_POINTS,
@@ -15,7 +15,6 @@ from caliv_graph.structure.planar import (
     SweepMotion,
     planar_patches,
 )
-from caliv_graph.structure.range_noise import RangeNoise
 
 SIGMA_M = 0.01
 

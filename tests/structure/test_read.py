@@ -16,8 +16,7 @@ from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, LidarScan, Trajectory
-from caliv_graph.structure.patches import DrivePatches
-from caliv_graph.structure.range_noise import RangeNoise
+from caliv_graph.structure.patches import DrivePatches, RangeNoise
 from caliv_graph.structure.read import (
     MAX_POSES,
     MAX_SCANS,

@@ -132,12 +132,13 @@ def static_objects(
         flat, candidate_set = extractor.candidate_set(joined, lidar)
         of_group = np.concatenate([np.array(of, np.int64) for of in objects])
         tracks = [np.flatnonzero(of_group == k) for k in range(len(groups))]
+    # First of all: the wall behind a target is seen in scans in which the target is not.
+    tracks = [track for track in tracks if not _is_cut_off(track, flat)] or tracks
     kept = tracks[:1]
     for track in tracks[1:]:
         if all(_is_another(track, other, flat, candidate_set, fewest) for other in kept):
             kept.append(track)
-    whole = [track for track in kept if not _is_cut_off(track, flat)]
-    kept = (whole or kept)[:MOST_OBJECTS]
+    kept = kept[:MOST_OBJECTS]
     if not kept:
         return None
     places, cov = _places(candidate_set, kept, flat)

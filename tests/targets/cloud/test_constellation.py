@@ -36,6 +36,7 @@ from caliv_graph.targets.cloud.constellation import (
     _plausible_matchings,
     match_objects,
     one_object,
+    static_objects,
 )
 from caliv_graph.targets.cloud.region import Candidate, RegionExtractor
 from caliv_graph.trajectory.select import smooth_trajectories
@@ -290,6 +291,26 @@ def test_boxes_that_stand_together_are_one_target(gap_m: float, placements: int)
             assert points <= shown.of("one") | shown.of("two")
             low, high = np.percentile(cloud.points_lidar, [2, 98], axis=0)
             assert high[1] - low[1] > 1.2  # 1.3 m from end to end
+
+
+def test_the_wall_behind_a_target_is_not_it_though_more_scans_show_it() -> None:
+    # 0.8 m behind the box, 1.7 m of 12 in the widened region, and a box in a third of the scans.
+    wall = BoxModel(xy_m=(11.0, 0.0), size_m=(0.2, 12.0, 2.0))
+    region = TargetRegion(min=(9.3, -0.6, -0.3), max=(10.7, 0.6, 2.0))
+    config = config_of(region, lidars={"left": guess("left", 0.0, sigma_deg=0.5)})
+    extractor = RegionExtractor(region, config, standing(scans=9))
+    found = []
+    for number in range(9):
+        objects = {"wall": wall, "two": BOXES["two"]} if number < 3 else {"wall": wall}
+        points = scene(objects, LEFT, seed=number).points_lidar
+        found.append(extractor.candidates(LidarScan("left", number, points, f"{number}.pcd"), 0))
+
+    seen = static_objects(extractor, found, "left", 3)
+
+    assert seen is not None
+    assert [len(of_scan) for of_scan in found] == [2, 2, 2, 1, 1, 1, 1, 1, 1]
+    assert seen.places[:, 0] == pytest.approx([9.65], abs=0.15)
+    assert len(seen.candidates[0]) == 3
 
 
 def test_joined_candidates_keep_the_times_of_their_points() -> None:

@@ -28,8 +28,9 @@ STEEP_COS = 0.35
 """Cosine of the incidence at least: at 70 degrees, bumps of 3 mm are 9 mm along the beam."""
 
 SMOOTH_SHARE = 0.25
-"""Share of the patches that are of smooth surfaces, at least; their quantile is the noise. Others
-are of leaves, which scatter by 30 mm and more of themselves."""
+SMOOTH_NORMAL = -0.674
+"""Share of the patches by which the noise is told, and the standard normal's quantile at it: the
+smoothest are of walls and ground. Others are of leaves, which scatter by 30 mm and more."""
 
 
 def measured_noise(
@@ -51,6 +52,9 @@ def measured_noise(
     centres = of_all[:, :3, 3] / points[:, None]
     cov = of_all[:, :3, :3] / points[:, None, None] - centres[:, :, None] * centres[:, None, :]
     beams, scatter = scatter_of_ranges(centres, cov, points)
+    # Over what a share of patches of noise alone is below (Wilson, Hilferty).
+    part = 2.0 / (9.0 * np.maximum(points - 3.0, 1.0))
+    scatter = scatter / (1.0 - part + SMOOTH_NORMAL * np.sqrt(part)) ** 1.5
     steep = -np.einsum("ni,ni->n", beams, normals) > STEEP_COS
     distance, scatter = np.linalg.norm(centres, axis=1)[steep], scatter[steep]
     number = np.floor(np.log(np.maximum(distance / FIRST_M, 1.0)) / np.log(WIDER))

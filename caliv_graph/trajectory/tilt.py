@@ -7,10 +7,12 @@ section 13).
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
@@ -37,6 +39,21 @@ sample of it."""
 SLOPE_SIGMA_RAD = math.radians(2.0)
 """1 sigma of the mean slope of the ground, per axis, where nothing tells it: roads have a crossfall
 of 2.5 percent."""
+
+SURFACE_SAMPLES = 120
+"""Samples by which the surface of the ground is told: half a second of a minute."""
+
+HILLS_M = (6.0, 12.0, 24.0, 48.0)
+HILL_SLOPES_RAD = tuple(np.radians([0.0, 0.5, 1.0, 2.0, 4.0, 8.0]).tolist())
+"""Lengths over which the slope of the ground changes, and 1 sigma of it: from kerbs and ramps to
+the side of a valley."""
+
+BUMPS_M = 2.0
+BUMP_SLOPES_RAD = tuple(np.radians([0.1, 0.3, 1.0, 3.0]).tolist())
+"""The same of bumps, of how the body leans in bends, and of what else the path does not follow."""
+
+SURFACE_NOISE_RAD = 2e-3
+"""1 sigma of a sample beside: steps of poses."""
 
 MIN_CLIMB_SIGMA_RAD = 1e-3
 MIN_SLOPE_SIGMA_RAD = 5e-3
@@ -86,12 +103,15 @@ def body_sigma_rad(config: Config) -> float:
 
 
 def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> VehicleTilt:
-    """Roll and pitch of the vehicle's axes over a drive, least squares with priors."""
+    """Roll and pitch of the vehicle's axes over a drive.
+
+    Pitch by least squares against the climb of the path, roll by `_across_a_surface`.
+    """
     begin, end = trajectory.span_ns
     count = min(MAX_SAMPLES, max(int((end - begin) // STEP_NS), 1))
     # From the start: since 1970 a float has steps of 256 ns, which may lie beyond the end.
     at = begin + np.linspace(0, end - begin, count).astype(np.int64)
-    R, _ = trajectory.poses_at(at)
+    R, t_map_vehicle = trajectory.poses_at(at)
     R = R @ _as_configured(trajectory)
     up = R[:, 2, :]  # e_z of the map in vehicle axes
     heading = np.arctan2(R[:, 1, 0], R[:, 0, 0])
@@ -106,42 +126,94 @@ def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> Ve
     climb *= ahead
     c, s = np.cos(heading), np.sin(heading)
     zero, one = np.zeros(count), np.ones(count)
-    # Unknowns: mean of up along x and along y, slope of the ground along the map's x and y.
+    # Unknowns: mean of up along x, slope of the ground along the map's x and y.
     groups = [
-        (np.stack([one, zero, zero, zero], 1)[driving], (up[:, 0] - climb)[driving]),
-        (np.stack([zero, zero, c, s], 1)[driving], climb[driving]),
-        (np.stack([one, zero, c, s], 1)[~driving], up[~driving, 0]),
-        (np.stack([zero, one, -s, c], 1), up[:, 1]),
+        (np.stack([one, zero, zero], 1)[driving], (up[:, 0] - climb)[driving]),
+        (np.stack([zero, c, s], 1)[driving], climb[driving]),
+        (np.stack([one, c, s], 1)[~driving], up[~driving, 0]),
     ]
-    least = (MIN_CLIMB_SIGMA_RAD, *[MIN_SLOPE_SIGMA_RAD] * 3)
+    least = (MIN_CLIMB_SIGMA_RAD, *[MIN_SLOPE_SIGMA_RAD] * 2)
     sigmas = np.array(least)
-    prior = np.diag([0.0, 0.0, SLOPE_SIGMA_RAD**-2, SLOPE_SIGMA_RAD**-2])
+    prior = np.diag([0.0, SLOPE_SIGMA_RAD**-2, SLOPE_SIGMA_RAD**-2])
     # So many samples count as one: correlated over `CORRELATED_S`.
     alike = max(CORRELATED_S * (count - 1) / max((end - begin) * 1e-9, 1e-9), 1.0)
-    found, information = np.zeros(4), prior
+    found, information = np.zeros(3), prior
     for _ in range(5):
         weights = [1.0 / (sigma**2 * alike) for sigma in sigmas]
         information = prior + sum(w * A.T @ A for w, (A, _) in zip(weights, groups, strict=True))
-        right = sum((w * A.T @ y for w, (A, y) in zip(weights, groups, strict=True)), np.zeros(4))
+        right = sum((w * A.T @ y for w, (A, y) in zip(weights, groups, strict=True)), np.zeros(3))
         found = np.linalg.lstsq(information, right)[0]
         spread = [
             float(np.sqrt(((y - A @ found) ** 2).mean())) if len(y) else 0.0 for A, y in groups
         ]
         sigmas = np.maximum(spread, least)
-        # Slopes across the path vary as those along it: beside a hill all of them are to one side.
-        sigmas[3] = max(sigmas[3], sigmas[1])
-    cov = np.linalg.pinv(information)[:2, :2]
-    cov = cov + _attitude_cov(trajectory)
-    body = body_sigma_rad(config)
-    x, y = found[:2]
+    x, variance = float(found[0]), float(np.linalg.pinv(information)[0, 0])
+    y, of_roll = _across_a_surface(
+        t_map_vehicle[:, :2], heading, np.where(driving, climb, np.nan), up[:, 1]
+    )
+    of_both = np.array([of_roll, variance]) + np.diag(_attitude_cov(trajectory))[::-1]
     z = float(np.median(up[:, 2]))
     # Nose up: up leans along +x in vehicle axes, which is a negative pitch; left side up: +y, roll.
     return VehicleTilt(
         name=name,
         roll_pitch_rad=np.array([math.atan2(y, z), -math.atan2(x, math.hypot(y, z))]),
-        sigma_rad=np.sqrt(np.array([cov[1, 1], cov[0, 0]]) + body**2),
+        sigma_rad=np.sqrt(of_both + body_sigma_rad(config) ** 2),
         given=not isinstance(trajectory, SmoothedTrajectory),
     )
+
+
+def _across_a_surface(
+    places: Array, heading: Array, climb: Array, up_left: Array
+) -> tuple[float, float]:
+    """Mean of up along the vehicle's y where the ground is a smooth random surface; its variance.
+
+    Its slopes along the path and across it are of one surface: hills of one size (squared
+    exponential, Rasmussen & Williams 2006, section 9.4), bumps, and a plane. Sizes are integrated
+    over, with the mean. A slope that is constant over the drive is not enough: beside a hill the
+    ground falls to one side all along the path.
+
+    Args:
+        places: (n, 2) metres.
+        heading: (n,) rad.
+        climb: (n,) of the path ahead; nan: the vehicle stands.
+        up_left: (n,) the vertical along the vehicle's y.
+    """
+    some = np.linspace(0, len(places) - 1, min(len(places), SURFACE_SAMPLES)).astype(np.int64)
+    places, heading, climb, up_left = (of[some] for of in (places, heading, climb, up_left))
+    known = np.flatnonzero(np.isfinite(climb))
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    at, along = np.vstack([places[known], places]), np.vstack([ahead[known], left])
+    y = np.concatenate([climb[known], up_left])
+    mean = np.append(np.zeros(len(known)), np.ones(len(places)))
+    d = at[:, None, :] - at[None, :, :]
+    square, cosine = np.einsum("ijk,ijk->ij", d, d), along @ along.T
+    both = np.einsum("ijk,ik->ij", d, along) * np.einsum("ijk,jk->ij", d, along)
+
+    def slopes(length_m: float) -> Array:
+        """Covariance of the slopes for a variance of one."""
+        return np.asarray((cosine - both / length_m**2) * np.exp(-0.5 * square / length_m**2))
+
+    base = SLOPE_SIGMA_RAD**2 * cosine + SURFACE_NOISE_RAD**2 * np.eye(len(y))
+    bumps = slopes(BUMPS_M)
+    told = []
+    for length_m in HILLS_M:
+        hills = slopes(length_m)
+        for hill, bump in itertools.product(HILL_SLOPES_RAD, BUMP_SLOPES_RAD):
+            lower = scipy.linalg.cholesky(base + hill**2 * hills + bump**2 * bumps, lower=True)
+            of_mean, of_y = scipy.linalg.solve_triangular(
+                lower, np.stack([mean, y], axis=1), lower=True
+            ).T
+            information = float(of_mean @ of_mean)
+            value = float(of_mean @ of_y) / information
+            cost = float(of_y @ of_y) - information * value**2
+            cost += 2.0 * float(np.log(np.diag(lower)).sum()) + math.log(information)
+            told.append((cost, value, 1.0 / information))
+    costs, values, variances = np.array(told).T
+    weights = np.exp(-0.5 * (costs - costs.min()))
+    weights /= weights.sum()
+    middle = float(weights @ values)
+    return middle, float(weights @ (variances + (values - middle) ** 2))
 
 
 def _as_configured(trajectory: VehicleTrajectory) -> Array:

@@ -75,6 +75,8 @@ def test_noise_as_configured() -> None:
     assert np.sqrt(noise.roughness_m2) == pytest.approx([LEAST_SIGMA_M] * 2)
     assert noise.floor_m == 0.05
     assert HeightNoise.configured(1, 0.0, 0.0).largest_m() == pytest.approx(LEAST_SIGMA_M)
+    of_each = HeightNoise.configured(2, np.array([0.01, 0.03]), 0.05)
+    assert np.sqrt(of_each.range_m2) == pytest.approx([0.01, 0.03])
 
 
 def simulated(

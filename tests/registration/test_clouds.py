@@ -274,7 +274,7 @@ def test_noise_along_the_beams_does_not_turn_normals_to_the_sensor() -> None:
 def test_clouds_of_another_lidar_are_not_merged() -> None:
     # Every other cloud is of another LiDAR, which is off by 4 cm.
     stack, R, t = leg_face()
-    two = replace(stack, lidar=np.arange(stack.count) % 2)
+    two = replace(stack, lidar=np.arange(stack.count) % 2, sigma_range_m=np.full(2, 0.01))
     off = t.copy()
     off[1::2] += [0.04, 0.0, 0.0]
     aligned = merged_normals(two, R, t)

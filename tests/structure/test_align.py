@@ -62,7 +62,7 @@ def patches_of(world: World, stamps_s: Array, seed: int = 1) -> DrivePatches:
             scan = spinner.scan(name, world, TRAJECTORY, stamp + 30_000_000 * k, rng)
             found = scan_patches(scan, TRUTH[name], TRAJECTORY, NOISE, keep_level=True)
             scans.append((k, scan.stamp_ns, found))
-    return _together(0, tuple(SPINNERS), scans, tuple(TRUTH.values()))
+    return _together(0, tuple(SPINNERS), scans, tuple(TRUTH.values()), {})
 
 
 @functools.cache

@@ -14,6 +14,7 @@ from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.tilt import vehicle_tilt
 from caliv_graph.wording.physics import tilt_finding
+from scripts.show_hills import beside_a_hill
 from tests.trajectory.motions import Course, Sensors, config_for, eight_drive, record
 
 CONFIG = config_for(Sensors())
@@ -53,24 +54,6 @@ def test_straight_uphill_pitch_is_known_and_roll_is_not() -> None:
     assert found.roll_pitch_rad[1] == pytest.approx(0.0, abs=0.003)
     assert found.sigma_rad[1] < 0.01 < 0.03 < found.sigma_rad[0]
     assert tilt_finding(found, CONFIG) is None
-
-
-def beside_a_hill(aside_m: float, width_m: float, high_m: float, bend_s: float) -> GivenTrajectory:
-    """60 s of bends to both sides, past the top of a round hill."""
-    t = np.arange(0.0, 60.0, 0.1)
-    yaw = 0.35 * np.sin(2.0 * math.pi * t / bend_s)
-    x, y = (np.cumsum(0.15 * of) for of in (np.cos(yaw), np.sin(yaw)))
-    x, y = x - x.mean(), y - y.mean() - aside_m
-    z = high_m * np.exp(-0.5 * (x**2 + y**2) / width_m**2)
-    poses = []
-    for psi, p in zip(yaw, np.stack([x, y, z], 1), strict=True):
-        up = np.array([p[0] * p[2] / width_m**2, p[1] * p[2] / width_m**2, 1.0])
-        up /= np.linalg.norm(up)
-        ahead = np.array([math.cos(psi), math.sin(psi), 0.0])
-        ahead -= up * (up @ ahead)
-        ahead /= np.linalg.norm(ahead)
-        poses.append(gtsam.Pose3(gtsam.Rot3(np.column_stack([ahead, np.cross(up, ahead), up])), p))
-    return GivenTrajectory(Trajectory(np.round(1e9 * t).astype(np.int64), tuple(poses)))
 
 
 @pytest.mark.parametrize(

@@ -124,8 +124,8 @@ def clock_findings(
     explains as much. Clocks that are all right by that are compared with each other: of this the
     motion data's own errors are no part, and a millisecond shows.
 
-    The clock of given poses is a variable of the graph, whose estimate has what all LiDARs of a
-    drive share against it: that they all are late is not said. Velocities have the noise of the
+    The clock of given poses is a variable of the graph, whose estimate has what LiDARs share
+    against it: they are judged against what most of them say. Velocities have the noise of the
     poses in them, and so has how these move what carries the vehicle: of a slow robot whose clocks
     were right all four LiDARs were 53 +- 8 ms late, where the graph had 0.0 +- 0.1.
     """
@@ -138,22 +138,22 @@ def clock_findings(
         if name in ("imu_time_offset", "twist_time_offset", "pose_time_offset")
     ]
 
-    of_poses = "pose_time_offset" in calibration.vehicle
+    def against(term: StructureTerm, late_s: float) -> list[Finding]:
+        found = [
+            clock_finding(names[term.drive], lidar, value_s + late_s, sigma_s)
+            for lidar, (value_s, sigma_s) in term.clocks.items()
+        ]
+        return [finding for finding in found if finding is not None]
 
-    def against(imu_late_s: float) -> tuple[Finding, ...]:
-        out: list[Finding] = []
+    shifts = [0.0, sum(inertial)]
+    if "pose_time_offset" in calibration.vehicle:
+        found: list[Finding] = []
         for term in terms:
-            of_lidars = [
-                clock_finding(names[term.drive], lidar, late_s + imu_late_s, sigma_s)
-                for lidar, (late_s, sigma_s) in term.clocks.items()
-            ]
-            found = [finding for finding in of_lidars if finding is not None]
-            if len(found) < len(of_lidars) or not of_poses:
-                out.extend(found)
-        return tuple(out)
-
-    found = min(against(0.0), against(sum(inertial)), key=len)
-    return found or _apart(names, terms)
+            of_lidars = [-value_s for value_s, _ in term.clocks.values()]
+            found += min([against(term, shift) for shift in (*shifts, *of_lidars)], key=len)
+    else:
+        found = min([[f for t in terms for f in against(t, shift)] for shift in shifts], key=len)
+    return tuple(found) or _apart(names, terms)
 
 
 def _has_culprit(calibration: Calibration) -> bool:

@@ -159,8 +159,15 @@ def test_a_clock_that_walls_contradict_leads_where_the_ranking_has_no_culprit() 
     poses = {"pose_time_offset": VehicleParameter(np.zeros(1), np.full(1, 1e-4), (True,))}
     given = replace(calm, vehicle=poses)
     assert clock_findings(["drive"], [term(front=(0.053, 0.008), rear=(0.053, 0.008))], given) == ()
-    (alone,) = clock_findings(["drive"], [term(front=(0.053, 0.008), rear=(0.0, 0.008))], given)
-    assert alone.input == "lidars.front.time_offset"
+    unequal = term(front=(0.053, 0.008), rear=(0.053, 0.008), left=(0.053, 0.015))
+    assert clock_findings(["drive"], [unequal], given) == ()
+    # One of them is; the clock of the poses may have been put in between.
+    between = VehicleParameter(np.full(1, -0.027), np.full(1, 2e-3), (True,))
+    for of_poses in (poses["pose_time_offset"], between):
+        late = replace(calm, vehicle={"pose_time_offset": of_poses})
+        one = term(front=(0.0, 0.004), rear=(0.053, 0.004))
+        (alone,) = clock_findings(["drive"], [one], late)
+        assert (alone.input, alone.value) == ("lidars.rear.time_offset", (0.053,))
     # 4.5 sigma are a warning, 3.9 are nothing.
     (doubt,) = clock_findings(["drive"], [term(front=(-0.009, 0.0))], calm)
     assert doubt.severity == "warning"

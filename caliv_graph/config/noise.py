@@ -10,7 +10,7 @@ from caliv_graph.config.sections import Fine, NonNegative, Positive, Section
 class NoiseConfig(Section):
     """Noise of each sensor, 1 sigma. Absent: message covariances, else the paper's table."""
 
-    lidar_range_m: Fine = Field(0.01, description="metres, along the beam")
+    lidar_range_m: Fine = Field(0.01, description="metres, along the beam, at least")
     lidar_range_bias_m: Positive | None = Field(
         None,
         description="metres, how much all ranges of a LiDAR on one target, on walls and on the "

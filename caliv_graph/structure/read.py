@@ -275,7 +275,14 @@ def _with_noise(
     stated_m = config.noise.lidar_range_m
     noise = measured_noise([p.moments for p in found], [p.normal_lidar for p in found], stated_m)
     rest = recording.scans(name, frozenset(stamps_ns.tolist()) - some)
-    return itertools.chain(first, rest), noise
+    return itertools.chain(_handed_over(first), rest), noise
+
+
+def _handed_over(scans: list[LidarScan]) -> Iterator[LidarScan]:
+    """Some scans, none of which is kept."""
+    scans.reverse()
+    while scans:
+        yield scans.pop()
 
 
 def _stamped(cut: Callable[[LidarScan], ScanPatches], scan: LidarScan) -> tuple[int, ScanPatches]:

@@ -197,7 +197,7 @@ def stack_of(
         normals=normals,
         flatness=np.ones(count) if flatness is None else flatness,
         whole=(points,),
-        sigma_range_m=sigma_range_m,
+        sigma_range_m=np.full(1, sigma_range_m),
     )
 
 

@@ -68,6 +68,33 @@ def test_a_hill_beside_the_path_is_no_tilt(hill: tuple[float, float, float, floa
     assert tilt_finding(found, CONFIG) is None
 
 
+@pytest.mark.parametrize(("roll_deg", "noise_m"), [(0.0, 0.05), (0.0, 0.2), (2.0, 0.05)])
+def test_noise_of_given_heights_is_no_rough_ground(roll_deg: float, noise_m: float) -> None:
+    # 50 mm are 50 mrad of climb over the metre and a half between two heights.
+    level = drive(0.0, True, (math.radians(roll_deg), 0.0)).trajectory
+    noise = np.random.default_rng(3).normal(0.0, noise_m, len(level.T_map_vehicle))
+    poses = tuple(
+        gtsam.Pose3(T.rotation(), np.add(T.translation(), [0.0, 0.0, off]))
+        for T, off in zip(level.T_map_vehicle, noise, strict=True)
+    )
+
+    found = vehicle_tilt(GivenTrajectory(Trajectory(level.stamps_ns, poses)), "drive", CONFIG)
+
+    assert np.degrees(found.roll_pitch_rad[0]) == pytest.approx(roll_deg, abs=0.3)
+    assert np.degrees(found.sigma_rad[0]) < 0.6
+    assert (tilt_finding(found, CONFIG) is not None) == (roll_deg > 0.0)
+
+
+def test_where_nothing_tells_the_slope_it_is_that_of_roads() -> None:
+    still = drive(0.0, False, (math.radians(8.0), 0.0)).trajectory
+    poses = (still.T_map_vehicle[0],) * len(still.stamps_ns)
+
+    found = vehicle_tilt(GivenTrajectory(Trajectory(still.stamps_ns, poses)), "drive", CONFIG)
+
+    assert np.degrees(found.roll_pitch_rad[0]) == pytest.approx(8.0, abs=0.01)
+    assert 2.0 < np.degrees(found.sigma_rad[0]) < 3.0
+
+
 def test_in_reverse_the_climb_counts_backwards() -> None:
     forward = drive(0.08, False, (0.0, 0.02)).trajectory
     back = Trajectory(forward.stamps_ns, tuple(reversed(forward.T_map_vehicle)))

@@ -24,6 +24,11 @@ PART_OF_SCANS = 0.5
 """An object beside another is static if it is seen in at least this part of the scans that see the
 other: somebody who stops for a while is not."""
 
+PART_OF_DRIVE = 0.25
+"""What is seen whole counts before what the region cuts off if the scans that see it are at least
+this part of those of the object that is seen most apart: somebody who stops before a wall is not.
+"""
+
 APART_M = 0.2
 """Minimum horizontal gap between two objects, as wide as the thinnest of them: what is nearer, or
 above, is a part of the same object that the clustering split off."""
@@ -132,8 +137,7 @@ def static_objects(
         flat, candidate_set = extractor.candidate_set(joined, lidar)
         of_group = np.concatenate([np.array(of, np.int64) for of in objects])
         tracks = [np.flatnonzero(of_group == k) for k in range(len(groups))]
-    # First of all: the wall behind a target is seen in scans in which the target is not.
-    tracks = [track for track in tracks if not _is_cut_off(track, flat)] or tracks
+    tracks = _whole(tracks, flat, candidate_set)
     kept = tracks[:1]
     for track in tracks[1:]:
         if all(_is_another(track, other, flat, candidate_set, fewest) for other in kept):
@@ -179,6 +183,21 @@ def _are_together(
     gap_m = np.median([_gap_m(a, b) for a, b in pairs])
     extent = np.median([extent_m(np.vstack([a.points_region, b.points_region])) for a, b in pairs])
     return bool(gap_m < TOGETHER_M and extent < MAX_EXTENT_M)
+
+
+def _whole(tracks: list[IntArray], flat: Sequence[Candidate], seen: CandidateSet) -> list[IntArray]:
+    """The tracks that the region does not cut off; all of them if none counts.
+
+    First of all: the wall behind a target is seen in scans in which the target is not. One counts
+    that has the height of a target and stands there for a good part of the drive.
+    """
+    whole = [track for track in tracks if not _is_cut_off(track, flat)]
+    longest = max((len(track) for track in tracks), default=0)
+    for track in whole:
+        lasts = np.ptp(seen.scan[track]) >= PART_OF_DRIVE * longest - 1
+        if lasts and np.median([flat[n].top_m for n in track.tolist()]) >= MIN_EXTENT_M:
+            return whole
+    return tracks
 
 
 def _is_cut_off(track: IntArray, flat: Sequence[Candidate]) -> bool:

@@ -293,7 +293,12 @@ def test_boxes_that_stand_together_are_one_target(gap_m: float, placements: int)
             assert high[1] - low[1] > 1.2  # 1.3 m from end to end
 
 
-def test_the_wall_behind_a_target_is_not_it_though_more_scans_show_it() -> None:
+@pytest.mark.parametrize(
+    ("with_box", "of_box"), [((0, 4, 8), True), ((3, 4), False)], ids=["stands", "stops"]
+)
+def test_the_wall_behind_a_target_is_not_it_though_more_scans_show_it(
+    with_box: tuple[int, ...], of_box: bool
+) -> None:
     # 0.8 m behind the box, 1.7 m of 12 in the widened region, and a box in a third of the scans.
     wall = BoxModel(xy_m=(11.0, 0.0), size_m=(0.2, 12.0, 2.0))
     region = TargetRegion(min=(9.3, -0.6, -0.3), max=(10.7, 0.6, 2.0))
@@ -301,16 +306,17 @@ def test_the_wall_behind_a_target_is_not_it_though_more_scans_show_it() -> None:
     extractor = RegionExtractor(region, config, standing(scans=9))
     found = []
     for number in range(9):
-        objects = {"wall": wall, "two": BOXES["two"]} if number < 3 else {"wall": wall}
+        objects = {"wall": wall, "two": BOXES["two"]} if number in with_box else {"wall": wall}
         points = scene(objects, LEFT, seed=number).points_lidar
         found.append(extractor.candidates(LidarScan("left", number, points, f"{number}.pcd"), 0))
 
-    seen = static_objects(extractor, found, "left", 3)
+    seen = static_objects(extractor, found, "left", 2)
 
     assert seen is not None
-    assert [len(of_scan) for of_scan in found] == [2, 2, 2, 1, 1, 1, 1, 1, 1]
-    assert seen.places[:, 0] == pytest.approx([9.65], abs=0.15)
-    assert len(seen.candidates[0]) == 3
+    assert [len(of_scan) for of_scan in found] == [2 if n in with_box else 1 for n in range(9)]
+    x_m, scans = (9.65, 3) if of_box else (10.9, 9)
+    assert seen.places[:, 0] == pytest.approx([x_m], abs=0.15)
+    assert len(seen.candidates[0]) == scans
 
 
 def test_joined_candidates_keep_the_times_of_their_points() -> None:

@@ -150,9 +150,12 @@ def clock_findings(
         found: list[Finding] = []
         for term in terms:
             of_lidars = [-value_s for value_s, _ in term.clocks.values()]
-            found += min([against(term, shift) for shift in (*shifts, *of_lidars)], key=len)
+            judged = [against(term, shift) for shift in (*shifts, *of_lidars)]
+            fewest = min(judged, key=len)
+            found += fewest
     else:
-        found = min([[f for t in terms for f in against(t, shift)] for shift in shifts], key=len)
+        judged = [[f for t in terms for f in against(t, shift)] for shift in shifts]
+        found = min(judged, key=len)
     return tuple(found) or _apart(names, terms)
 
 

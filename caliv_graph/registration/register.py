@@ -147,9 +147,9 @@ class JointRegistration:
             )
         self.observation = observation
         most = config.registration.max_points
-        names = list(dict.fromkeys(cloud.lidar for cloud in observation.clouds))
+        self._names = list(dict.fromkeys(cloud.lidar for cloud in observation.clouds))
         stated_m, told_m = config.noise.lidar_range_m, observation.range_noise_m
-        sigmas_m = np.array([max(stated_m, told_m.get(name, 0.0)) for name in names])
+        sigmas_m = np.array([max(stated_m, told_m.get(name, 0.0)) for name in self._names])
         self.clouds: CloudStack = stack_clouds(
             observation, min(most, ROUGH_POINTS) if rough else most, sigmas_m, normals
         )
@@ -216,8 +216,8 @@ class JointRegistration:
         """
         clouds = self.observation.clouds
         middles = middles_of(self.clouds, R, t, [cloud.cut for cloud in clouds])
-        names = list(dict.fromkeys(cloud.lidar for cloud in clouds))
-        sigmas = np.array([self._guess_sigmas.get(name, DEFAULT_GUESS_SIGMAS) for name in names])
+        known = self._guess_sigmas
+        sigmas = np.array([known.get(name, DEFAULT_GUESS_SIGMAS) for name in self._names])
         largest = sigmas.reshape(-1, 2, 3).max(axis=2)
         apart = placed_by_motion(middles, R, t, self.clouds.lidar, largest)
         return np.asarray(apart - np.einsum("jab,jb->ja", R, middles.points))

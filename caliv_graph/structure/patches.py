@@ -187,11 +187,16 @@ class DrivePatches:
         Metres, lidar frame as of the patch's own time. About the plane that fits the *ranges* best:
         directions of beams have no noise, so that it does not turn towards them.
         """
-        centres = self.centres_lidar
-        cov = self.moments[:, :3, :3] / self.points[:, None, None]
-        cov = cov - centres[:, :, None] * centres[:, None, :]
-        u, scatter_m = scatter_of_ranges(centres, cov, self.points)
+        u, scatter_m = scatter_of_ranges(*spread_of(self.moments), self.points)
         return np.asarray(u * (scatter_m * np.sqrt(self.points))[:, None])
+
+
+def spread_of(moments: Array) -> tuple[Array, Array]:
+    """Middles (N, 3) of the points of moments (N, 4, 4), and their covariances (N, 3, 3)."""
+    points = moments[:, 3, 3]
+    centres = moments[:, :3, 3] / points[:, None]
+    cov = moments[:, :3, :3] / points[:, None, None] - centres[:, :, None] * centres[:, None, :]
+    return centres, cov
 
 
 def scatter_of_ranges(centres_lidar: Array, cov: Array, points: Array) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ import numpy as np
 from caliv_graph.common.sorting import stable_order
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.channels import ChannelSums, PointChannels
-from caliv_graph.structure.patches import RangeNoise, Swept, scatter_of_ranges
+from caliv_graph.structure.patches import RangeNoise, Swept, scatter_of_ranges, spread_of
 
 PATCH_M = 0.5
 """Width of a patch across the beams: below the cells of 1 to 2 m over which real walls are uneven,
@@ -308,8 +308,7 @@ def _judged(
             np.hstack([motion.turn, motion.velocity])[k],
         )
     moments = _moments(p, first, count)
-    centre = moments[:, :3, 3] / count[:, None]
-    cov = moments[:, :3, :3] / count[:, None, None] - centre[:, :, None] * centre[:, None, :]
+    centre, cov = spread_of(moments)
     values, axes = np.linalg.eigh(cov)
     width = np.sqrt(np.maximum(values, 0.0))
     normal = axes[:, :, 0]

@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from caliv_graph.products import Array, TargetObservation
-from caliv_graph.structure.patches import DrivePatches, RangeNoise, scatter_of_ranges
+from caliv_graph.products import TargetObservation
+from caliv_graph.structure.patches import DrivePatches, RangeNoise, scatter_of_ranges, spread_of
+from caliv_graph.structure.planar import ScanPatches
 
 OPEN_M = 0.06
 """Noise that patches may have when it is measured, 1 sigma: no LiDAR for vehicles has more at the
@@ -33,24 +34,15 @@ SMOOTH_NORMAL = -0.674
 smoothest are of walls and ground. Others are of leaves, which scatter by 30 mm and more."""
 
 
-def measured_noise(
-    moments: Sequence[Array], normals_lidar: Sequence[Array], stated_m: float
-) -> RangeNoise:
-    """The noise of a LiDAR by its patches, at least what is stated.
+def measured_noise(found: Sequence[ScanPatches], stated_m: float) -> RangeNoise:
+    """The noise of a LiDAR by the patches of scans, cut with `OPEN_M`; at least what is stated.
 
     Noise does not fall with the distance, and grows no faster than it: near or far leaves, of which
     there may be nothing else at some distance, are held by walls at another.
-
-    Args:
-        moments: of each scan (n, 4, 4) of its patches, as in `ScanPatches`, cut with `OPEN_M`.
-        normals_lidar: of each scan (n, 3).
-        stated_m: 1 sigma.
     """
-    of_all = np.concatenate([np.zeros((0, 4, 4)), *moments])
-    normals = np.concatenate([np.zeros((0, 3)), *normals_lidar])
-    points = of_all[:, 3, 3]
-    centres = of_all[:, :3, 3] / points[:, None]
-    cov = of_all[:, :3, :3] / points[:, None, None] - centres[:, :, None] * centres[:, None, :]
+    moments = np.concatenate([np.zeros((0, 4, 4)), *(of.moments for of in found)])
+    normals = np.concatenate([np.zeros((0, 3)), *(of.normal_lidar for of in found)])
+    points, (centres, cov) = moments[:, 3, 3], spread_of(moments)
     beams, scatter = scatter_of_ranges(centres, cov, points)
     # Over what a share of patches of noise alone is below (Wilson, Hilferty).
     part = 2.0 / (9.0 * np.maximum(points - 3.0, 1.0))

@@ -272,8 +272,7 @@ def _with_noise(
     first = list(recording.scans(name, some))
     freely = partial(cut, noise=RangeNoise.constant(OPEN_M), keep_level=True)
     found = list(worked_together(freely, first))
-    stated_m = config.noise.lidar_range_m
-    noise = measured_noise([p.moments for p in found], [p.normal_lidar for p in found], stated_m)
+    noise = measured_noise(found, config.noise.lidar_range_m)
     rest = recording.scans(name, frozenset(stamps_ns.tolist()) - some)
     return itertools.chain(_handed_over(first), rest), noise
 

@@ -33,7 +33,7 @@ def cut(*walls: tuple[float, float], scatter_m: float = 0.0, seed: int = 0) -> l
 
 
 def measured(*found: ScanPatches) -> RangeNoise:
-    return measured_noise([p.moments for p in found], [p.normal_lidar for p in found], STATED_M)
+    return measured_noise(found, STATED_M)
 
 
 def test_noise_is_measured_by_distance() -> None:
@@ -46,7 +46,7 @@ def test_noise_is_measured_by_distance() -> None:
 
 def test_what_is_stated_is_the_least_of_it_and_all_where_nothing_is_seen() -> None:
     assert measured(*cut((6.0, 0.002), (20.0, 0.003))).at(np.array([6.0])) == STATED_M
-    nothing = measured_noise([], [], STATED_M)
+    nothing = measured_noise([], STATED_M)
     assert nothing.at(np.array([1.0, 50.0])) == pytest.approx([STATED_M] * 2)
 
 

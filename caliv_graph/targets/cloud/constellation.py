@@ -25,9 +25,8 @@ PART_OF_SCANS = 0.5
 other: somebody who stops for a while is not."""
 
 PART_OF_DRIVE = 0.25
-"""What is seen whole counts before what the region cuts off if the scans that see it are at least
-this part of those of the object that is seen most apart: somebody who stops before a wall is not.
-"""
+"""What is seen whole counts before what the region cuts off if it is seen over at least this part
+of the scans that the object seen most often has: somebody who stops before a wall is not."""
 
 APART_M = 0.2
 """Minimum horizontal gap between two objects, as wide as the thinnest of them: what is nearer, or
@@ -142,7 +141,8 @@ def static_objects(
     for track in tracks[1:]:
         if all(_is_another(track, other, flat, candidate_set, fewest) for other in kept):
             kept.append(track)
-    kept = kept[:MOST_OBJECTS]
+    whole = [track for track in kept if not _is_cut_off(track, flat)]
+    kept = (whole or kept)[:MOST_OBJECTS]
     if not kept:
         return None
     places, cov = _places(candidate_set, kept, flat)
@@ -195,9 +195,14 @@ def _whole(tracks: list[IntArray], flat: Sequence[Candidate], seen: CandidateSet
     longest = max((len(track) for track in tracks), default=0)
     for track in whole:
         lasts = np.ptp(seen.scan[track]) >= PART_OF_DRIVE * longest - 1
-        if lasts and np.median([flat[n].top_m for n in track.tolist()]) >= MIN_EXTENT_M:
+        if lasts and _is_high(track, flat):
             return whole
     return tracks
+
+
+def _is_high(track: IntArray, flat: Sequence[Candidate]) -> bool:
+    """Whether a track is of something of a target's height."""
+    return float(np.median([flat[n].top_m for n in track.tolist()])) >= MIN_EXTENT_M
 
 
 def _is_cut_off(track: IntArray, flat: Sequence[Candidate]) -> bool:
@@ -210,7 +215,7 @@ def _is_another(
     track: IntArray, other: IntArray, flat: Sequence[Candidate], seen: CandidateSet, fewest: int
 ) -> bool:
     """Whether a track is of a static object of a target's height, apart from that of another."""
-    if np.median([flat[n].top_m for n in track.tolist()]) < MIN_EXTENT_M:
+    if not _is_high(track, flat):
         return False
     at_once, of_track, of_other = np.intersect1d(
         seen.scan[track], seen.scan[other], return_indices=True

@@ -176,6 +176,7 @@ class PlacedPatches:
 
     Attributes:
         moments_at_stamp: (N, 4, 4) in the lidar frame at the stamps of their scans.
+        origins_at_stamp: (N, 3) where the LiDAR was when it saw each, likewise.
         normals_at_stamp: (N, 3) likewise.
         scatter_at_stamp: (N, 3) `DrivePatches.scatter_along_beam_m`, likewise.
         R_map_lidar: (N, 3, 3) at these stamps.
@@ -184,6 +185,7 @@ class PlacedPatches:
     """
 
     moments_at_stamp: Array
+    origins_at_stamp: Array
     normals_at_stamp: Array
     scatter_at_stamp: Array
     R_map_lidar: Array
@@ -205,11 +207,11 @@ def placed_patches(problem: Problem, state: State) -> PlacedPatches:
     """The patches of a drive at an estimate."""
     scan = problem.patches.scan
     lidar = problem.patches.scan_lidar[scan]
-    moments, normals, scatter = _at_stamp(problem, state, lidar)
+    moved = _at_stamp(problem, state, lidar)
     R, t = lidar_poses(
         state, lidar, problem.pose_of_scan[scan], problem.twists, problem.accelerations
     )
-    return PlacedPatches(moments, normals, scatter, R, t, state.T_vehicle_lidar)
+    return PlacedPatches(*moved, R, t, state.T_vehicle_lidar)
 
 
 def placed_sightings(
@@ -231,6 +233,7 @@ def placed_sightings(
     return sightings_of(
         problem.patches,
         placed.moments_at_stamp,
+        placed.origins_at_stamp,
         normals,
         placed.scatter_at_stamp,
         strips,
@@ -257,15 +260,15 @@ def layout_of(problem: Problem, strips: Strips) -> Layout:
     )
 
 
-def _at_stamp(problem: Problem, state: State, lidar: IntArray) -> tuple[Array, Array, Array]:
-    """Moments, normals and scatter of all patches in the lidar frame at their scans' stamps."""
+def _at_stamp(problem: Problem, state: State, lidar: IntArray) -> tuple[Array, Array, Array, Array]:
+    """The first four of `PlacedPatches`."""
     patches = problem.patches
     scatter = patches.scatter_along_beam_m
     if not patches.time_s.any():
-        return patches.moments, patches.normal_lidar, scatter
+        return patches.moments, np.zeros_like(scatter), patches.normal_lidar, scatter
     R, t = _motion_since_stamp(problem, state.T_vehicle_lidar, lidar)
     normals, scatter = (np.einsum("nij,nj->ni", R, v) for v in (patches.normal_lidar, scatter))
-    return moved_moments(patches.moments, R, t), normals, scatter
+    return moved_moments(patches.moments, R, t), t, normals, scatter
 
 
 def _motion_since_stamp(

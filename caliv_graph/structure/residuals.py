@@ -201,7 +201,7 @@ def geometry_of(
     centre, normal = state.centres_map[strip], state.normals_map[strip]
     m = np.einsum("qji,qj->qi", R, normal)
     error_columns = _error_columns(layout, lidar, surface, strip)
-    by_error = _by_error(sightings, m, normal[:, 2] > LEVEL)
+    by_error = _by_error(sightings, normal[:, 2] > LEVEL)
 
     plain = np.zeros((q, 4))
     plain[:, :3] = m
@@ -383,26 +383,20 @@ def _error_columns(layout: Layout, lidar: IntArray, surface: IntArray, strip: In
     return np.stack([first, first + 1, first + 2, of_surface, of_strip], axis=1)
 
 
-def _by_error(sightings: Sightings, normals_lidar: Array, level: BoolArray) -> Array:
+def _by_error(sightings: Sightings, level: BoolArray) -> Array:
     """(Q, 5, 4) what each error of a LiDAR adds to the residual, linear in h = (p, 1).
 
-    A range that is too long by b moves a point by `-b cos(incidence)` along the normal; the cosine
-    changes over a strip: on ground that looks like a tilt. Errors: bias, its growth with
-    1 / cos(incidence), bias on the ground (`level` strips), bias on the surface, offset on the
-    strip.
+    Errors: bias of the ranges (`sightings.seen_ranges`), its growth with 1 / cos(incidence), bias
+    on the ground (`level` strips), bias on the surface, offset on the strip.
     """
-    centroid = sightings.centroids_lidar
-    distance = np.linalg.norm(centroid, axis=1)[:, None]
-    u = centroid / distance
-    cos = -np.einsum("qi,qi->q", normals_lidar, u)
-    # Along the plane only: a change along the normal would scale the points' scatter away.
-    slope = -cos[:, None] * (u + cos[:, None] * normals_lidar) / distance
-    out = np.zeros((len(u), 5, 4))
-    out[:, 0, :3] = slope
-    out[:, 0, 3] = cos - np.einsum("qi,qi->q", slope, centroid)
-    out[:, 1] = -out[:, 0]
-    out[:, 1, 3] += 1.0
-    out[:, 2] = np.where(level[:, None], out[:, 0], 0.0)
-    out[:, 3] = out[:, 0]
+    out = np.zeros((sightings.count, 5, 4))
     out[:, 4, 3] = 1.0
+    by_range = sightings.by_range
+    if by_range is None:
+        return out
+    out[:, 0] = by_range
+    out[:, 1] = -by_range
+    out[:, 1, 3] += 1.0
+    out[:, 2] = np.where(level[:, None], by_range, 0.0)
+    out[:, 3] = by_range
     return out

@@ -11,7 +11,7 @@ from caliv_graph.config.range_errors import GRAZING_COS
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import BeamGroups, SeenBeams, seen_beams
 from caliv_graph.structure.bends import seen_bends
-from caliv_graph.structure.patches import DrivePatches, along_surface
+from caliv_graph.structure.patches import DrivePatches, along_surface, fitted_along
 from caliv_graph.structure.strips import Strips
 
 ROUGHNESS_M = 0.003
@@ -41,6 +41,7 @@ class Sightings:
         T_vehicle_lidar: of each LiDAR, with which points of other times were moved to the stamps.
         beams: what errors of the beams add; None: they have none.
         bends: (Q, BENDS, 4) what bends of the strips add (`bends.py`); None: strips are flat.
+        by_range: (Q, 4) what ranges that are a metre too long add (`seen_ranges`); None: none is.
     """
 
     scan: IntArray
@@ -52,6 +53,7 @@ class Sightings:
     T_vehicle_lidar: tuple[gtsam.Pose3, ...]
     beams: SeenBeams | None = None
     bends: Array | None = None
+    by_range: Array | None = None
 
     @property
     def count(self) -> int:
@@ -75,6 +77,7 @@ class Sightings:
             points=self.points[keep],
             beams=self.beams and self.beams.only(keep),
             bends=None if self.bends is None else self.bends[keep],
+            by_range=None if self.by_range is None else self.by_range[keep],
         )
 
 
@@ -91,6 +94,7 @@ def point_weights(
     """(N,) weight of a point's distance from its plane, 1/m^2.
 
     Noise along the beam counts by the cosine of the incidence, that across it by the sine.
+    `centres_lidar` (N, 3) are seen from where the LiDAR was.
     """
     distance = np.linalg.norm(centres_lidar, axis=1)
     cos = np.abs(np.einsum("ni,ni->n", centres_lidar, normals_lidar)) / distance
@@ -98,9 +102,40 @@ def point_weights(
     return np.asarray(1.0 / ((range_sigma_m * cos) ** 2 + across + ROUGHNESS_M**2))
 
 
+def seen_ranges(moments: Array, origins: Array, normals: Array, starts: IntArray) -> Array:
+    """(Q, 4) what ranges that are a metre too long add to the residuals of sightings.
+
+    A point moves by `-cos(incidence)` along the normal. The cosine is by the beam from where the
+    LiDAR was when the patch was measured: at the stamp it is half a metre away, and ground that
+    is a metre from there would be tilted. Linear within a patch, fitted by a plane over a sighting;
+    along the surface only: a change along the normal would scale the points' scatter away.
+
+    Args:
+        moments: (n, 4, 4) weighted, of the patches, sighting by sighting, in a lidar frame.
+        origins: (n, 3) where the LiDAR was, in that frame.
+        normals: (n, 3) of their strips in that frame.
+        starts: (Q,) first patch of each sighting.
+    """
+    middle = moments[:, :3, 3] / moments[:, 3, 3, None]
+    from_lidar = middle - origins
+    distance = np.linalg.norm(from_lidar, axis=1)[:, None]
+    u = from_lidar / distance
+    cos = -np.einsum("ni,ni->n", normals, u)
+    by_point = np.zeros((len(u), 1, 4))
+    by_point[:, 0, :3] = -cos[:, None] * (u + cos[:, None] * normals) / distance
+    by_point[:, 0, 3] = cos - np.einsum("ni,ni->n", by_point[:, 0, :3], middle)
+    of_patches = by_point @ moments
+    return fitted_along(
+        np.add.reduceat(moments, starts),
+        normals[starts],
+        np.add.reduceat(of_patches, starts),
+    )[:, 0]
+
+
 def sightings_of(
     patches: DrivePatches,
     moments_at_stamp: Array,
+    origins_at_stamp: Array,
     normals_at_stamp: Array,
     scatter_at_stamp: Array,
     strips: Strips,
@@ -114,6 +149,7 @@ def sightings_of(
     Args:
         patches: all patches.
         moments_at_stamp: (N, 4, 4) moments in the lidar frame at the scan's stamp.
+        origins_at_stamp: (N, 3) where the LiDAR was when it saw them, in that frame.
         normals_at_stamp: (N, 3) normals of their strips in that frame, of patches on a strip.
         scatter_at_stamp: (N, 3) scatter of their points along the beams, in that frame.
         strips: which patch is on which.
@@ -124,9 +160,10 @@ def sightings_of(
             strip; None: strips are flat.
     """
     own = np.flatnonzero(strips.of_patch >= 0)
-    places = moments_at_stamp[own, :3, 3]
-    seen = np.abs(np.einsum("ni,ni->n", places, normals_at_stamp[own]))
-    own = own[seen > MIN_COS * np.linalg.norm(places, axis=1)]
+    middles = moments_at_stamp[:, :3, 3] / moments_at_stamp[:, 3, 3, None]
+    from_lidar = middles - origins_at_stamp
+    seen = np.abs(np.einsum("ni,ni->n", from_lidar[own], normals_at_stamp[own]))
+    own = own[seen > MIN_COS * np.linalg.norm(from_lidar[own], axis=1)]
     key = patches.scan[own] * max(strips.count, 1) + strips.of_patch[own]
     order = np.argsort(key, kind="stable")
     own, key = own[order], key[order]
@@ -134,10 +171,9 @@ def sightings_of(
         none, nothing = np.zeros(0, np.int64), np.zeros((0, 4, 4))
         return Sightings(none, none, nothing, nothing, np.zeros(0), np.zeros(0), T_vehicle_lidar)
     starts = np.flatnonzero(np.diff(key, prepend=-1))
-    centres = moments_at_stamp[own, :3, 3] / moments_at_stamp[own, 3, 3, None]
     sigma = range_sigma_m[patches.scan_lidar[patches.scan[own]]]
     normals = normals_at_stamp[own]
-    weight = point_weights(centres, normals, sigma)
+    weight = point_weights(from_lidar[own], normals, sigma)
     weighted = weight[:, None, None] * moments_at_stamp[own]
     moments = np.add.reduceat(weighted, starts)
     of_beams = None
@@ -162,6 +198,7 @@ def sightings_of(
         T_vehicle_lidar=T_vehicle_lidar,
         beams=of_beams,
         bends=bends,
+        by_range=seen_ranges(weighted, origins_at_stamp[own], normals, starts),
     )
 
 

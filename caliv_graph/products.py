@@ -261,6 +261,8 @@ class TargetCloud:
             target off: there the cloud ends before the target does. Empty: it is whole.
         swept: the points as they were measured, each at its own time, if the LiDAR gives times:
             for a new motion compensation once the extrinsic is known better.
+        origins_lidar: (N, 3) metres, where the LiDAR was at the time of each point, lidar frame;
+            None: at the origin.
     """
 
     lidar: str
@@ -270,6 +272,14 @@ class TargetCloud:
     source: str
     cut: frozenset[Side] = frozenset()
     swept: LidarScan | None = None
+    origins_lidar: Array | None = None
+
+    @property
+    def beams_lidar(self) -> Array:
+        """(N, 3) unit vectors from where the LiDAR was to the points, lidar frame."""
+        points = self.points_lidar
+        beams = points if self.origins_lidar is None else points - self.origins_lidar
+        return np.asarray(beams / np.linalg.norm(beams, axis=1)[:, None])
 
     @property
     def apart_s(self) -> float:

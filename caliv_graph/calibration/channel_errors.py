@@ -39,14 +39,19 @@ ChannelSizes = Mapping[str, tuple[float, float, float]]
 def channel_sizes(
     lidars: Sequence[str], found: Sequence[ChannelSizes], usual: RangeErrors
 ) -> ChannelSizes:
-    """Sizes that structure found in some drives, as root mean squares; where in none, `usual`."""
+    """Sizes that structure found in some drives, as root mean squares.
+
+    Where in none they are those of their priors in `usual`, as where structure tells nothing.
+    """
+    range_m, elevation_rad, azimuth_rad, *_ = (prior.usual for prior in usual.beam_priors)
+    unknown = range_m, elevation_rad, azimuth_rad
     out = {}
     for name in lidars:
         own = [of_drive[name] for of_drive in found if name in of_drive]
-        range_m, elevation_rad, azimuth_rad, *_ = usual.beams
+        out[name] = unknown
         if own:
             range_m, elevation_rad, azimuth_rad = np.sqrt(np.square(own).mean(axis=0)).tolist()
-        out[name] = (range_m, elevation_rad, azimuth_rad)
+            out[name] = range_m, elevation_rad, azimuth_rad
     return out
 
 

@@ -78,7 +78,7 @@ from caliv_graph.products import (
 )
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.targets.ground.planes import ground_floors
-from caliv_graph.trajectory.deskew import deskew
+from caliv_graph.trajectory.deskew import deskewed_with_origins
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 FURTHER_SOLVES = 2
@@ -436,8 +436,10 @@ def _deskewed(
     clouds = []
     for cloud in observation.clouds:
         if cloud.swept is not None:
-            scan = deskew(cloud.swept, extrinsics[cloud.lidar], trajectories[cloud.drive])
-            cloud = replace(cloud, points_lidar=scan.points_lidar)
+            points, origins = deskewed_with_origins(
+                cloud.swept, extrinsics[cloud.lidar], trajectories[cloud.drive]
+            )
+            cloud = replace(cloud, points_lidar=points, origins_lidar=origins)
         clouds.append(cloud)
     return replace(observation, clouds=tuple(clouds))
 

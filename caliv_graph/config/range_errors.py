@@ -56,6 +56,10 @@ BEAM_M = 1e-3
 BEAM_RAD = 5e-5
 """Sigma of the error of elevation and azimuth of one channel, likewise."""
 
+BEAM_SIZES = np.geomspace(0.1, 30.0, 15)
+"""Sizes of the errors of the beams in the integral, in these: up to 3 cm and 1.5 mrad, unless less
+is stated of the ranges."""
+
 CHANNELS_APART_RAD = 0.01
 """Usual angle between two channels: in that distance an error of the beams is another."""
 
@@ -88,6 +92,11 @@ class RangeErrors:
         """
         change = (self.beam_m / CHANNELS_APART_RAD, BEAM_RAD / CHANNELS_APART_RAD)
         return self.beam_m, BEAM_RAD, BEAM_RAD, *change
+
+    @property
+    def beam_priors(self) -> tuple[SizePrior, ...]:
+        """The priors of these sizes, about them as medians."""
+        return tuple(log_normal(median * BEAM_SIZES, median) for median in self.beams)
 
     @property
     def offsets(self) -> SizePrior:

@@ -222,14 +222,16 @@ def stack_clouds(
     `merged_normals` follows, all normals point to the sensor. The noise along the beam, of each
     LiDAR (L,) or of all, is in metres.
     """
-    points, normal, flatness = [], [], []
+    points, beams, normal, flatness = [], [], [], []
     lidar = _indices([cloud.lidar for cloud in observation.clouds])
     sigmas = np.full(int(lidar.max()) + 1, sigma_range_m)
     for cloud, sigma_m in zip(observation.clouds, sigmas[lidar].tolist(), strict=True):
-        kept = cloud.points_lidar
+        kept, along = cloud.points_lidar, cloud.beams_lidar
         if len(kept) > max_points:
-            kept = kept[np.sort(np.argsort(sampling_order(kept))[:max_points])]
+            some = np.sort(np.argsort(sampling_order(kept))[:max_points])
+            kept, along = kept[some], along[some]
         points.append(kept)
+        beams.append(along)
         if normals:
             n, flat = surface_normals(kept, sigma_m, cloud.points_lidar)
         else:
@@ -239,14 +241,14 @@ def stack_clouds(
     sizes = np.array([len(p) for p in points])
     stacked = np.concatenate(points)
     flat = np.concatenate(flatness)
-    beams = stacked / np.linalg.norm(stacked, axis=1)[:, None]
+    along_beams = np.concatenate(beams)
     return CloudStack(
         points=stacked,
         cloud=np.repeat(np.arange(len(points)), sizes),
         starts=np.concatenate([[0], np.cumsum(sizes)[:-1]]),
         lidar=lidar,
-        beams=beams,
-        normals=_towards_sensor(np.concatenate(normal), flat, beams),
+        beams=along_beams,
+        normals=_towards_sensor(np.concatenate(normal), flat, along_beams),
         flatness=flat,
         whole=tuple(cloud.points_lidar for cloud in observation.clouds),
         sigma_range_m=sigmas,

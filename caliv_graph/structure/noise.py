@@ -11,7 +11,7 @@ import scipy.linalg
 from scipy.optimize import nnls
 
 from caliv_graph.common.memory import give_back_freed_arrays
-from caliv_graph.config.range_errors import RangeErrors, SizePrior, log_normal, size_weights
+from caliv_graph.config.range_errors import RangeErrors, SizePrior, size_weights
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import BeamErrors, mean_rows, parts_of
 from caliv_graph.structure.bends import BENDS, USUAL_PER_M
@@ -57,10 +57,6 @@ ONE_VIEW_M = 0.005
 footprint and incidence looks like another extrinsic, and no difference shows it. Data sheets state
 accuracies of ranges of one to three centimetres; a part of it changes from strip to strip. On a
 real road at 7 m (`edgar_static`) two LiDARs agree to 0.2 mm, 5 mrad beside the truth."""
-
-BEAM_SIZES = np.geomspace(0.1, 30.0, 15)
-"""Sizes of the errors of the beams in the integral, in usual ones: up to 3 cm and 1.5 mrad, unless
-less is stated of the ranges."""
 
 SMOOTH = 3
 """Powers of the elevation, from 0 on, that say nothing of the sizes."""
@@ -456,7 +452,7 @@ def beam_sigmas(
         beams: of each LiDAR.
         ranges: what is stated of the ranges.
     """
-    priors = [log_normal(usual * BEAM_SIZES, usual) for usual in ranges.beams]
+    priors = ranges.beam_priors
     sigma = before.copy()
     for _ in range(BEAM_ROUNDS):
         joint = np.asarray(np.linalg.inv(data + mean + np.diag(sigma**-2.0)), dtype=np.float64)

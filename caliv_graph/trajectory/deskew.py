@@ -38,6 +38,28 @@ def deskew(
     return replace(scan, points_lidar=points, point_times_s=None)
 
 
+def deskewed_with_origins(
+    scan: LidarScan, T_vehicle_lidar: gtsam.Pose3, trajectory: VehicleTrajectory
+) -> tuple[Array, Array]:
+    """Points (N, 3) of a scan moved as by `deskew`, and where the LiDAR was at their times (N, 3).
+
+    A beam went from there to the point. At 10 m/s that is up to a metre from where the LiDAR is at
+    the stamp.
+
+    Raises:
+        TrajectoryError: as `deskew`.
+    """
+    times_s = scan.point_times_s
+    both = replace(
+        scan,
+        points_lidar=np.vstack([scan.points_lidar, np.zeros_like(scan.points_lidar)]),
+        point_times_s=None if times_s is None else np.tile(times_s, 2),
+    )
+    (moved,) = deskewed(both, [T_vehicle_lidar], trajectory)
+    points, origins = np.split(moved, 2)
+    return points, origins
+
+
 def deskewed(
     scan: LidarScan, T_vehicle_lidar: Iterable[gtsam.Pose3], trajectory: VehicleTrajectory
 ) -> Iterator[Array]:

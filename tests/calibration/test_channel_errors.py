@@ -163,7 +163,8 @@ def test_clouds_that_see_few_channels_of_a_group_have_more_of_their_errors() -> 
 
 def test_sizes_are_those_of_structure_where_it_tells_some() -> None:
     usual = channel_sizes(("front", "rear"), (), UNSTATED)
-    assert usual["front"] == usual["rear"] == UNSTATED.beams[:3]
+    # Root mean squares of the priors, 2.3 times their medians of 1 mm and 0.05 mrad.
+    assert usual["front"] == usual["rear"] == pytest.approx((2.3e-3, 1.15e-4, 1.15e-4), rel=2e-3)
     found: list[ChannelSizes] = [{"rear": (3e-3, 1e-4, 2e-4)}, {"rear": (4e-3, 1e-4, 0.0)}]
     sizes = channel_sizes(("front", "rear"), found, UNSTATED)
     assert sizes["front"] == usual["front"]

@@ -194,6 +194,20 @@ def test_beams_point_from_the_sensor() -> None:
     assert np.sum(stack.normals * stack.beams, axis=1).max() < 0.0
 
 
+def test_beams_point_from_where_the_sensor_was() -> None:
+    clouds, _ = three_clouds()
+    seen = observe(clouds)
+    origins = np.column_stack([np.linspace(0.0, 0.5, 300), np.zeros((300, 2))])
+    swept = replace(seen.clouds[1], origins_lidar=origins)
+    stack = stack_clouds(replace(seen, clouds=(seen.clouds[0], swept)), 100, 1e-4)
+    order = {tuple(p): i for i, p in enumerate(clouds[1].tolist())}
+    drawn = [order[tuple(p)] for p in stack.points[40:].tolist()]
+    beams = (clouds[1] - origins)[drawn]
+    np.testing.assert_allclose(
+        stack.beams[40:], beams / np.linalg.norm(beams, axis=1)[:, None], atol=1e-12
+    )
+
+
 def test_without_a_surface_the_normal_is_the_direction_to_the_sensor() -> None:
     rng = np.random.default_rng(8)
     bush = np.array([5.0, 1.0, 0.0]) + 0.05 * rng.normal(size=(60, 3))

@@ -10,7 +10,7 @@ import pytest
 
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, LidarScan, Trajectory
-from caliv_graph.trajectory.deskew import deskew
+from caliv_graph.trajectory.deskew import deskew, deskewed_with_origins
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from tests.trajectory.motions import (
@@ -65,6 +65,22 @@ def test_a_straight_drive_by_hand() -> None:
     # Seen 0.1 s later, the vehicle was 0.3 m farther on.
     np.testing.assert_allclose(moved.points_lidar, [[10.0, 0.0, 0.0], [10.3, 0.0, 0.0]], atol=1e-9)
     assert moved.point_times_s is None
+
+
+def test_beams_begin_where_the_lidar_was() -> None:
+    """At 3 m/s it is 0.3 m farther on after 0.1 s; ranges are those that it measured."""
+    T = gtsam.Pose3(gtsam.Rot3.Yaw(0.5 * np.pi), np.array([2.0, 0.0, 1.0]))
+    measured = np.array([[10.0, 0.0, 0.0], [4.0, 3.0, -1.0]])
+    scan = LidarScan("left", START_NS + 500_000_000, measured, "scan", np.array([0.0, 0.1]))
+    points, origins = deskewed_with_origins(scan, T, even_turn(0.0, 3.0))
+    # Ahead is to the right of a LiDAR that looks to the left.
+    np.testing.assert_allclose(origins, [[0.0, 0.0, 0.0], [0.0, -0.3, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(points - origins, measured, atol=1e-9)
+    np.testing.assert_array_equal(points, deskew(scan, T, even_turn(0.0, 3.0)).points_lidar)
+    at_once = replace(scan, point_times_s=None)
+    points, origins = deskewed_with_origins(at_once, T, even_turn(0.0, 3.0))
+    assert (points == measured).all()
+    assert not origins.any()
 
 
 def test_a_turn_by_hand() -> None:

@@ -33,7 +33,7 @@ from caliv_graph.targets.cloud.groups import (
 from caliv_graph.targets.cloud.tally import EMPTY, MOVED, NOTHING, OUTSIDE, Tally
 from caliv_graph.targets.cloud.track import CandidateSet
 from caliv_graph.targets.ground.fit import fit_ground
-from caliv_graph.trajectory.deskew import checked_times, deskew
+from caliv_graph.trajectory.deskew import checked_times, deskewed_with_origins
 from caliv_graph.trajectory.select import VehicleTrajectory
 
 GUESS_SIGMAS = 2.0
@@ -107,6 +107,9 @@ class Candidate:
         """This one and another one of the same scan as one object."""
         points = np.vstack([self.cloud.points_lidar, other.cloud.points_lidar])
         swept, more = self.cloud.swept, other.cloud.swept
+        origins, others = self.cloud.origins_lidar, other.cloud.origins_lidar
+        if origins is not None and others is not None:
+            origins = np.vstack([origins, others])
         if swept is not None and more is not None:
             # Only clouds whose points have times are kept as they were swept.
             points_s = np.concatenate([swept.point_times_s, more.point_times_s])
@@ -114,7 +117,7 @@ class Candidate:
             swept = replace(swept, points_lidar=measured, point_times_s=points_s)
         return replace(
             self,
-            cloud=replace(self.cloud, points_lidar=points, swept=swept),
+            cloud=replace(self.cloud, points_lidar=points, swept=swept, origins_lidar=origins),
             centre_lidar=_middle(points),
             measured_lidar=np.vstack([self.measured_lidar, other.measured_lidar]),
             top_m=max(self.top_m, other.top_m),
@@ -262,9 +265,11 @@ class RegionExtractor:
                 continue
             times = None if scan.point_times_s is None else scan.point_times_s[kept]
             compact = replace(scan, points_lidar=scan.points_lidar[kept], point_times_s=times)
-            target = deskew(compact, self._guess[scan.lidar], self.trajectory).points_lidar
-            swept = None if times is None else compact
-            cloud = TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source, swept=swept)
+            guess = self._guess[scan.lidar]
+            target, origins = deskewed_with_origins(compact, guess, self.trajectory)
+            cloud = TargetCloud(scan.lidar, drive, scan.stamp_ns, target, scan.source)
+            if times is not None:
+                cloud = replace(cloud, swept=compact, origins_lidar=origins)
             centre, measured = _middle(target), compact.points_lidar
             top_m = math.inf if plane is None else float(height[chosen].max())
             out.append(Candidate(cloud, centre, R, t, measured, spacing.row, top_m, is_cut_off))

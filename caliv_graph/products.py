@@ -279,7 +279,13 @@ class TargetCloud:
         """(N, 3) unit vectors from where the LiDAR was to the points, lidar frame."""
         points = self.points_lidar
         beams = points if self.origins_lidar is None else points - self.origins_lidar
-        return np.asarray(beams / np.linalg.norm(beams, axis=1)[:, None])
+        return np.asarray(beams / np.maximum(np.linalg.norm(beams, axis=1), 1e-9)[:, None])
+
+    @property
+    def seen_from_lidar(self) -> Array:
+        """(3,) metres, mean of `origins_lidar`."""
+        origins = self.origins_lidar
+        return np.zeros(3) if origins is None else np.asarray(origins.mean(axis=0))
 
     @property
     def apart_s(self) -> float:

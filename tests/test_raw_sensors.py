@@ -203,6 +203,21 @@ def test_scans_that_cannot_see_the_target_are_not_decoded() -> None:
     assert set(extracted()[1]) == set(drive().config.lidars)
 
 
+def test_beams_begin_where_the_lidars_were() -> None:
+    """As the clouds were found, and as they were put together again with what was found."""
+    again = [registration.observation for registration in run().solution.registrations]
+    clouds = [cloud for of in (*run().observations, *again) for cloud in of.clouds]
+    farthest_m = 0.0
+    for cloud in clouds:
+        assert cloud.swept is not None
+        assert cloud.origins_lidar is not None
+        ranges = np.linalg.norm(cloud.swept.points_lidar, axis=1)
+        seen = np.linalg.norm(cloud.points_lidar - cloud.origins_lidar, axis=1)
+        assert seen == pytest.approx(ranges, abs=1e-6)
+        farthest_m = max(farthest_m, float(np.linalg.norm(cloud.seen_from_lidar)))
+    assert farthest_m > 0.1
+
+
 def test_poses_are_as_uncertain_as_the_motion_data_and_heave_say() -> None:
     clouds = run().observations
     stamps = sorted({c.stamp_ns for o in clouds for c in o.clouds})[:5]

@@ -43,12 +43,11 @@ def channel_sizes(
 
     Where in none they are those of their priors in `usual`, as where structure tells nothing.
     """
-    range_m, elevation_rad, azimuth_rad, *_ = (prior.usual for prior in usual.beam_priors)
-    unknown = range_m, elevation_rad, azimuth_rad
+    unknown_m, unknown_up_rad, unknown_aside_rad, *_ = (of.usual for of in usual.beam_priors)
     out = {}
     for name in lidars:
         own = [of_drive[name] for of_drive in found if name in of_drive]
-        out[name] = unknown
+        out[name] = unknown_m, unknown_up_rad, unknown_aside_rad
         if own:
             range_m, elevation_rad, azimuth_rad = np.sqrt(np.square(own).mean(axis=0)).tolist()
             out[name] = range_m, elevation_rad, azimuth_rad
@@ -83,7 +82,7 @@ class OwnChannels:
         lidars = tuple(dict.fromkeys(name for own in names for name in own))
         index = [np.array([lidars.index(name) for name in own], dtype=np.int64) for own in names]
         of_point = [own[s.clouds.cloud] for own, s in zip(index, states, strict=True)]
-        elevation = [elevations(state.clouds.points) for state in states]
+        elevation = [elevations(state.clouds.beams) for state in states]
         group = [np.zeros(len(of), dtype=np.int64) for of in elevation]
         owner, parts, begin = [], [], 0
         for a in range(len(lidars)):
@@ -169,7 +168,7 @@ def _part_of_one(shares: Array, groups: IntArray) -> Array:
 
 def _moves(clouds: CloudStack, group: IntArray, groups: int) -> Array:
     """`OwnChannels.moves` of a placement, from the group (N,) of each point."""
-    middle = clouds.centres
+    middle = clouds.centres - clouds.seen_from
     far = np.linalg.norm(middle, axis=1)
     view = middle / far[:, None]
     level = cross(np.array([0.0, 0.0, 1.0]), view)

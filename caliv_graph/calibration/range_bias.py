@@ -174,7 +174,10 @@ def _of_placement(
     views = beams / np.linalg.norm(beams, axis=1)[:, None]
     middles = _turned(R, clouds.centres) + t
     incidence = np.zeros((clouds.count, 6, clouds.lidars, 2))
-    incidence[each, :, clouds.lidar] = _by_incidence(quadratic, t, state.mixture.normals_target)
+    sensors = _turned(R, clouds.seen_from) + t
+    incidence[each, :, clouds.lidar] = _by_incidence(
+        quadratic, sensors, state.mixture.normals_target
+    )
     roughness = np.sqrt(np.maximum(state.noise.roughness_m2 - LEAST_SIGMA_M**2, 0.0))
     smooth = [np.zeros((clouds.count, 6, 0))]
     for a in np.flatnonzero(roughness > 0.0).tolist():

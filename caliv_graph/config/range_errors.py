@@ -86,7 +86,7 @@ class RangeErrors:
 
     @property
     def beams(self) -> tuple[float, ...]:
-        """1 sigma of the errors of the beams at one elevation, where nothing tells.
+        """Medians of the sizes of the errors of the beams at one elevation.
 
         Range (m), elevation and azimuth (rad), change of range (m/rad) and elevation with it.
         """
@@ -95,8 +95,14 @@ class RangeErrors:
 
     @property
     def beam_priors(self) -> tuple[SizePrior, ...]:
-        """The priors of these sizes, about them as medians."""
-        return tuple(log_normal(median * BEAM_SIZES, median) for median in self.beams)
+        """The priors of these sizes, about them as medians; of ranges at most what is stated."""
+        most_m = math.inf if self.offset_m is None else self.offset_m
+        most = (most_m, math.inf, math.inf, most_m / CHANNELS_APART_RAD, math.inf)
+        priors = [log_normal(median * BEAM_SIZES, median) for median in self.beams]
+        return tuple(
+            SizePrior(np.minimum(prior.sigmas, limit), prior.cost)
+            for prior, limit in zip(priors, most, strict=True)
+        )
 
     @property
     def offsets(self) -> SizePrior:

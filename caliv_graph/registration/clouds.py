@@ -76,6 +76,7 @@ class CloudStack:
             or noisy; there the normal is the direction to the sensor.
         whole: J clouds before thinning, for the normals.
         sigma_range_m: (L,) noise along the beams of each LiDAR, 1 sigma, metres.
+        seen_from: (J, 3) metres, where the LiDAR was when it measured each, lidar frame.
     """
 
     points: Array
@@ -87,6 +88,7 @@ class CloudStack:
     flatness: Array
     whole: tuple[Array, ...]
     sigma_range_m: Array
+    seen_from: Array
 
     def points_of(self, which: IntArray) -> IntArray:
         """Indices of the points of these clouds, one cloud after the other."""
@@ -109,6 +111,7 @@ class CloudStack:
             flatness=self.flatness[kept],
             whole=tuple(self.whole[j] for j in which.tolist()),
             sigma_range_m=self.sigma_range_m,
+            seen_from=self.seen_from[which],
         )
 
     @property
@@ -197,17 +200,21 @@ def sampling_order(points: Array) -> npt.NDArray[np.uint64]:
 
 
 def surface_normals(
-    points: Array, sigma_range_m: float, around: Array | None = None
+    points: Array,
+    sigma_range_m: float,
+    around: Array | None = None,
+    beams: Array | None = None,
 ) -> tuple[Array, Array]:
     """(N, 3) unit normals towards the sensor, and (N,) flatness 0 to 1, of points of one cloud.
 
     `points` (N, 3) and the whole cloud `around` (M, 3), by default the same, are in metres, lidar
-    frame. The noise along the beam limits the flatness.
+    frame. The noise along the beam limits the flatness. `beams` (M, 3), unit vectors to `around`,
+    are by default from the origin.
     """
     around = points if around is None else around
-    return _normals_across(
-        points, around, around, SINGLE_NEIGHBOURS, SINGLE_RADIUS_M, sigma_range_m
-    )
+    if beams is None:
+        beams = around / np.maximum(np.linalg.norm(around, axis=1), 1e-9)[:, None]
+    return _normals_across(points, around, beams, SINGLE_NEIGHBOURS, SINGLE_RADIUS_M, sigma_range_m)
 
 
 def stack_clouds(
@@ -233,7 +240,7 @@ def stack_clouds(
         points.append(kept)
         beams.append(along)
         if normals:
-            n, flat = surface_normals(kept, sigma_m, cloud.points_lidar)
+            n, flat = surface_normals(kept, sigma_m, cloud.points_lidar, cloud.beams_lidar)
         else:
             n, flat = np.zeros_like(kept), np.zeros(len(kept))
         normal.append(n)
@@ -252,6 +259,7 @@ def stack_clouds(
         flatness=flat,
         whole=tuple(cloud.points_lidar for cloud in observation.clouds),
         sigma_range_m=sigmas,
+        seen_from=np.array([cloud.seen_from_lidar for cloud in observation.clouds]),
     )
 
 

@@ -113,7 +113,11 @@ def views_of(registration: Registration, most: int = MOST_VIEWS) -> tuple[View, 
         apart = np.minimum(apart, np.arccos(np.clip(towards @ towards[chosen[-1]], -1.0, 1.0)))
     clouds = registration.observation.clouds
     return tuple(
-        View(t[j], clouds[j].points_lidar @ R[j].T + t[j], not clouds[j].cut)
+        View(
+            R[j] @ clouds[j].seen_from_lidar + t[j],
+            clouds[j].points_lidar @ R[j].T + t[j],
+            not clouds[j].cut,
+        )
         for j in explained[chosen].tolist()
     )
 

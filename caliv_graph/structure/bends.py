@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.patches import fitted_along
+from caliv_graph.structure.patches import fitted_over
 
 BENDS = 3
 """Of a strip: curvature along its first axis, twist, curvature along its second axis, 1/m."""
@@ -54,9 +54,4 @@ def seen_bends(
     by_point = np.zeros((len(x), BENDS, 4))
     by_point[:, :, :3] = slope @ axes_lidar
     by_point[:, :, 3] = height - np.einsum("nki,ni->nk", by_point[:, :, :3], middle)
-    of_patches = by_point @ moments
-    return -fitted_along(
-        np.add.reduceat(moments, starts),
-        normals[starts],
-        np.add.reduceat(of_patches, starts),
-    )
+    return -fitted_over(by_point, moments, normals, starts)

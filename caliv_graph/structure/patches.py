@@ -238,6 +238,19 @@ def fitted_along(moments: Array, normals: Array, total: Array, of: IntArray | No
     return np.asarray(np.swapaxes(N @ np.linalg.solve(inner, right), 1, 2))
 
 
+def fitted_over(by_point: Array, moments: Array, normals: Array, starts: IntArray) -> Array:
+    """(Q, k, 4) functions of h that are linear along a surface, nearest to those of its patches.
+
+    Args:
+        by_point: (n, k, 4) functions of h, of the points of each patch.
+        moments: (n, 4, 4) of the points.
+        normals: (n, 3) of their surfaces.
+        starts: (Q,) first patch of each sum of patches.
+    """
+    whole = np.add.reduceat(moments, starts)
+    return fitted_along(whole, normals[starts], np.add.reduceat(by_point @ moments, starts))
+
+
 def along_surface(moments: Array, normals: Array) -> Array:
     """(N, 4, 3) functions of h: one, and the two places (m) along a surface about the middle.
 

@@ -11,7 +11,7 @@ from caliv_graph.config.range_errors import GRAZING_COS
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import BeamGroups, SeenBeams, seen_beams
 from caliv_graph.structure.bends import seen_bends
-from caliv_graph.structure.patches import DrivePatches, along_surface, fitted_along
+from caliv_graph.structure.patches import DrivePatches, along_surface, fitted_over
 from caliv_graph.structure.strips import Strips
 
 ROUGHNESS_M = 0.003
@@ -118,18 +118,13 @@ def seen_ranges(moments: Array, origins: Array, normals: Array, starts: IntArray
     """
     middle = moments[:, :3, 3] / moments[:, 3, 3, None]
     from_lidar = middle - origins
-    distance = np.linalg.norm(from_lidar, axis=1)[:, None]
+    distance = np.maximum(np.linalg.norm(from_lidar, axis=1), 1e-9)[:, None]
     u = from_lidar / distance
     cos = -np.einsum("ni,ni->n", normals, u)
     by_point = np.zeros((len(u), 1, 4))
     by_point[:, 0, :3] = -cos[:, None] * (u + cos[:, None] * normals) / distance
     by_point[:, 0, 3] = cos - np.einsum("ni,ni->n", by_point[:, 0, :3], middle)
-    of_patches = by_point @ moments
-    return fitted_along(
-        np.add.reduceat(moments, starts),
-        normals[starts],
-        np.add.reduceat(of_patches, starts),
-    )[:, 0]
+    return np.asarray(fitted_over(by_point, moments, normals, starts)[:, 0])
 
 
 def sightings_of(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import gtsam
@@ -15,9 +16,12 @@ from caliv_graph.calibration.channel_errors import (
     channel_sizes,
 )
 from caliv_graph.calibration.range_bias import without_bias
-from caliv_graph.config.range_errors import UNSTATED
+from caliv_graph.config.range_errors import UNSTATED, RangeErrors
 from caliv_graph.products import Array, TargetCloud, TargetObservation
 from caliv_graph.registration.register import JointRegistration
+from caliv_graph.structure.beams import CHANNEL_KINDS
+from caliv_graph.structure.channels import found_channels
+from caliv_graph.targets.cloud.beams import elevations
 from tests.registration.scenes import chair_scene, config_of, looking_at_target, matrices
 
 RANGE, ELEVATION, AZIMUTH = 0, 1, 2
@@ -159,6 +163,41 @@ def test_clouds_that_see_few_channels_of_a_group_have_more_of_their_errors() -> 
     sideways = np.sqrt((D.reshape(4, 6, -1) ** 2).sum(axis=2))[:, 4] / 8.0
     assert sideways[1] == pytest.approx(2**-0.5, rel=0.1)
     assert 20**-0.5 < sideways[0] < 0.6 * sideways[1]  # of two groups more than its own
+
+
+def test_what_is_stated_of_the_ranges_is_the_most_of_channels() -> None:
+    for stated_m in (5e-4, 2e-3, 2e-2):
+        usual = RangeErrors(offset_m=stated_m, beam_m=min(1e-3, stated_m))
+        ((range_m, *_),) = channel_sizes(("front",), (), usual).values()
+        assert range_m <= stated_m
+    assert range_m == pytest.approx(2.3e-3, rel=0.01)
+
+
+def test_channels_are_found_by_the_beams_of_a_lidar_that_drives() -> None:
+    """16 channels of 2 degrees on a board, from 12 to 4 m away, at 10 m/s in sweeps of 0.1 s.
+
+    By where the LiDAR is at the stamp elevations are up to 40 mrad off: no channels are seen.
+    """
+    elevation = np.radians(np.arange(-15.0, 16.0, 2.0))
+    clouds = []
+    for j, x_m in enumerate(np.linspace(12.0, 4.0, 17).tolist()):
+        azimuth = np.linspace(-0.06, 0.06, 24)
+        time_s = np.linspace(0.0, 0.1, 24)
+        a, e = (g.ravel() for g in np.meshgrid(azimuth, elevation))
+        beams = np.column_stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        origins = np.column_stack([10.0 * np.tile(time_s, 16), np.zeros((len(a), 2))])
+        points = origins + beams * ((x_m - origins[:, :1]) / beams[:, :1])
+        seen = np.abs(points[:, 2]) < 0.8
+        cloud = TargetCloud("front", 0, j, points[seen], f"{j}.pcd")
+        clouds.append(replace(cloud, origins_lidar=origins[seen]))
+    state = JointRegistration(TargetObservation(0, "t", np.zeros(3), tuple(clouds)), config_of())
+    assert found_channels(elevations(state.clouds.points)) is None
+    own = OwnChannels.of([state])
+    # Eight groups of one or two of the channels that the clouds see, and not of bins of 0.01 rad.
+    seen_channels = found_channels(elevations(state.clouds.beams))
+    assert seen_channels is not None
+    assert seen_channels == pytest.approx(elevation[np.abs(np.tan(elevation)) < 0.2], abs=1e-3)
+    assert len(own.part) == CHANNEL_KINDS * min(len(seen_channels), MOST_GROUPS)
 
 
 def test_sizes_are_those_of_structure_where_it_tells_some() -> None:

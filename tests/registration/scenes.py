@@ -198,6 +198,7 @@ def stack_of(
         flatness=np.ones(count) if flatness is None else flatness,
         whole=(points,),
         sigma_range_m=np.full(1, sigma_range_m),
+        seen_from=np.zeros((len(starts), 3)),
     )
 
 

@@ -170,7 +170,8 @@ def test_clouds_stand_one_after_the_other_and_large_ones_are_thinned() -> None:
     order = {tuple(p): i for i, p in enumerate(clouds[1].tolist())}
     drawn = [order[tuple(p)] for p in stack.points[40:140].tolist()]
     assert drawn == sorted(set(drawn))
-    normals, flatness = surface_normals(clouds[1], 1e-4)
+    beams = clouds[1] / np.linalg.norm(clouds[1], axis=1)[:, None]
+    normals, flatness = surface_normals(clouds[1], 1e-4, beams=beams)
     np.testing.assert_array_equal(stack.flatness[40:140], flatness[drawn])
     trusted = stack.flatness[40:140] > 0.98
     assert trusted.sum() > 60

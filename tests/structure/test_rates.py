@@ -8,7 +8,7 @@ import pytest
 
 from caliv_graph.geometry.se3 import stack, vehicle_axes_difference
 from caliv_graph.products import Array
-from caliv_graph.structure.problem import Problem
+from caliv_graph.structure.problem import Problem, first_state, placed_patches
 from caliv_graph.structure.sightings import moved_moments
 from caliv_graph.structure.slow_errors import told_of_errors
 from caliv_graph.structure.solve import Solved, solve_roughly
@@ -67,6 +67,21 @@ def with_sweeps(problem: Problem, off: Array) -> Problem:
         ),
         relative=np.array([gtsam.Pose3.Expmap(v).matrix() for v in swept]),
     )
+
+
+def test_patches_are_seen_from_where_the_lidar_was(swept: Problem) -> None:
+    """A metre from where it is at the stamp: ranges and incidences are those that it measured."""
+    patches = swept.patches
+    placed = placed_patches(swept, first_state(swept, TRUE))
+    middles = placed.moments_at_stamp[:, :3, 3] / placed.moments_at_stamp[:, 3, 3, None]
+    beams = middles - placed.origins_at_stamp
+    assert np.linalg.norm(placed.origins_at_stamp, axis=1).max() > 0.8
+    own = patches.centres_lidar
+    ranges = np.linalg.norm(own, axis=1)
+    assert np.linalg.norm(beams, axis=1) == pytest.approx(ranges, abs=1e-9)
+    incidence = np.einsum("ni,ni->n", patches.normal_lidar, own)
+    seen = np.einsum("ni,ni->n", placed.normals_at_stamp, beams)
+    assert seen == pytest.approx(incidence, abs=1e-9)
 
 
 def nees(found: Solved, motion: Array) -> float:

@@ -144,7 +144,7 @@ def test_a_mount_that_slips_is_found(solved: Solved) -> None:
         assert (slip.lidars, slip.others) == ((name,), ())
         assert slip.since_s == pytest.approx(9 * STEP_NS * 1e-9)
         assert slip.lasts_s == pytest.approx(17 * STEP_NS * 1e-9)
-        assert slip.sigmas > 2.0 * SAID_SIGMAS
+        assert slip.sigmas > 2.0 * SAID_SIGMAS  # 12.1 and 9.4
         start = dict(zip(TRUE, found.state.T_vehicle_lidar, strict=True))
         measured = measured_slip(problem, start, slip)
         R = TRUE[name].rotation().matrix()

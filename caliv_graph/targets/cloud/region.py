@@ -108,8 +108,7 @@ class Candidate:
         points = np.vstack([self.cloud.points_lidar, other.cloud.points_lidar])
         swept, more = self.cloud.swept, other.cloud.swept
         origins, others = self.cloud.origins_lidar, other.cloud.origins_lidar
-        if origins is not None and others is not None:
-            origins = np.vstack([origins, others])
+        both = None if origins is None or others is None else np.vstack([origins, others])
         if swept is not None and more is not None:
             # Only clouds whose points have times are kept as they were swept.
             points_s = np.concatenate([swept.point_times_s, more.point_times_s])
@@ -117,7 +116,7 @@ class Candidate:
             swept = replace(swept, points_lidar=measured, point_times_s=points_s)
         return replace(
             self,
-            cloud=replace(self.cloud, points_lidar=points, swept=swept, origins_lidar=origins),
+            cloud=replace(self.cloud, points_lidar=points, swept=swept, origins_lidar=both),
             centre_lidar=_middle(points),
             measured_lidar=np.vstack([self.measured_lidar, other.measured_lidar]),
             top_m=max(self.top_m, other.top_m),

@@ -119,10 +119,11 @@ class GroundMeter:
         if plane is None:
             self._without[scan.lidar][reason] += 1
             return None
-        # From where the LiDAR was at their times: half a metre on, the incidence is another.
+        # From where the LiDAR was at their times: half a metre on, the incidence is another. By the
+        # velocity at the stamp that is right to centimetres, and costs nothing.
         velocity = (guess.inverse().AdjointMap() @ twist)[3:]
         from_lidar = points - times_s[:, None] * velocity
-        beams = from_lidar / np.linalg.norm(from_lidar, axis=1)[:, None]
+        beams = from_lidar / np.maximum(np.linalg.norm(from_lidar, axis=1), 1e-9)[:, None]
         # As on the plane: what stands on it, nearly upright to the beams, has no part in the fit.
         across = np.maximum(-beams @ plane.normal_lidar, MIN_SLOPE)
         moved = [beams, *(beams * more[:, None] for more in growth(across).T)]

@@ -319,17 +319,21 @@ def test_the_wall_behind_a_target_is_not_it_though_more_scans_show_it(
     assert len(seen.candidates[0]) == scans
 
 
-def test_joined_candidates_keep_the_times_of_their_points() -> None:
+def test_joined_candidates_keep_times_and_origins_of_their_points() -> None:
     def candidate(x_m: float, time_s: float, top_m: float) -> Candidate:
         points = np.array([[x_m, 0.0, 0.0], [x_m, 1.0, 0.0]])
         swept = LidarScan("left", 5, points + 0.1, "scan", np.full(2, time_s))
-        cloud = TargetCloud("left", 0, 5, points, "scan", swept=swept)
+        cloud = TargetCloud(
+            "left", 0, 5, points, "scan", swept=swept, origins_lidar=np.full((2, 3), time_s)
+        )
         middle = points.mean(axis=0)
         return Candidate(cloud, middle, np.eye(3), np.zeros(3), points + 0.1, 0.01, top_m, False)
 
     one = candidate(4.0, 0.01, 0.4).joined(candidate(6.0, 0.02, 0.9))
 
     assert one.cloud.points_lidar[:, 0].tolist() == [4.0, 4.0, 6.0, 6.0]
+    assert one.cloud.origins_lidar is not None
+    assert one.cloud.origins_lidar[:, 0].tolist() == [0.01, 0.01, 0.02, 0.02]
     assert one.cloud.swept is not None
     assert one.cloud.swept.point_times_s is not None
     assert one.cloud.swept.point_times_s.tolist() == [0.01, 0.01, 0.02, 0.02]

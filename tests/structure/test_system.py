@@ -209,9 +209,8 @@ def test_a_range_that_is_too_long_is_undone_all_over_a_strip() -> None:
 
     The cosine of the incidence goes from 0.55 to 0.27. By where the LiDAR is at the stamp a
     quarter of a millimetre would be left, in every scan to the same side: of two LiDARs near the
-    ground with biases of -10 and 4 mm, S2S
-    roll was 0.38 mrad and z 5 mm off at a claimed 0.03 and 0.9 (random drive 92 of the second
-    simulator on flat ground).
+    ground with biases of -10 and 4 mm, S2S roll was 0.38 mrad and z 5 mm off at a claimed 0.03 and
+    0.9 (random drive 92 of the second simulator on flat ground).
     """
     rng = np.random.default_rng(0)
     layout = Layout(1, 0, (), 1, (0,))

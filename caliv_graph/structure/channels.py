@@ -87,6 +87,12 @@ def found_channels(elevation_rad: Array) -> Array | None:
 
     None if they cannot be told apart, or are more than `MOST_CHANNELS`.
     """
+    found = found_rows(elevation_rad)
+    return None if found is None or len(found) > MOST_CHANNELS else found
+
+
+def found_rows(elevation_rad: Array) -> Array | None:
+    """`found_channels`, however many they are."""
     if not len(elevation_rad):
         return None
     place = ((elevation_rad - elevation_rad.min()) / BIN_RAD).astype(np.int64)
@@ -99,7 +105,7 @@ def found_channels(elevation_rad: Array) -> Array | None:
     before = np.concatenate([[0], np.cumsum(count)])
     several = before[end] - before[begin] >= LEAST_OF_CHANNEL
     begin, end = begin[several], end[several]
-    if not 0 < len(begin) <= MOST_CHANNELS:
+    if not len(begin):
         return None
     width, between = end - begin, begin[1:] - end[:-1]
     gap = np.minimum(np.append(between, len(count)), np.append(len(count), between))

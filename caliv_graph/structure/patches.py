@@ -103,6 +103,8 @@ class DrivePatches:
         channels: what the points of each channel add; None: no LiDAR has channels. They are
             multiplied by errors of millimetres, so that they follow no extrinsics.
         noise: of the LiDARs whose scans were read, by their index in `lidars`.
+        without_rows: indices in `lidars` of those whose beams are in no rows: a few lasers take
+            turns in all directions.
     """
 
     drive: int
@@ -118,6 +120,7 @@ class DrivePatches:
     moved_with: tuple[gtsam.Pose3, ...] = ()
     channels: ChannelSums | None = None
     noise: Mapping[int, RangeNoise] = field(default_factory=dict)
+    without_rows: frozenset[int] = frozenset()
 
     def part(self, keep: BoolArray) -> DrivePatches:
         """Some of the patches (N,), of the same scans."""

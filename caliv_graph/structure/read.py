@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import gtsam
@@ -15,11 +16,12 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, IntArray, LidarScan, Recording
-from caliv_graph.structure.channels import ChannelSums
+from caliv_graph.structure.channels import ChannelSums, found_rows
 from caliv_graph.structure.noise import roughness_m
 from caliv_graph.structure.patches import DrivePatches, RangeNoise, Swept
 from caliv_graph.structure.planar import SLOT_S, ScanPatches, SweepMotion, planar_patches
 from caliv_graph.structure.range_noise import OPEN_M, measured_noise
+from caliv_graph.targets.cloud.beams import elevations
 from caliv_graph.targets.cloud.views import evenly_spread
 from caliv_graph.trajectory.deskew import checked_times
 from caliv_graph.trajectory.imu import log_so3
@@ -109,20 +111,25 @@ def read_patches(
         for drive, recording in enumerate(recordings):
             scans: list[tuple[int, int, ScanPatches]] = []
             noises: dict[int, RangeNoise] = {}
+            without_rows: set[int] = set()
             for k, name in enumerate(names):
                 if not len(wanted[drive][k]):
                     continue
                 cut = partial(
                     scan_patches, T_vehicle_lidar=guesses[k], trajectory=trajectories[drive]
                 )
-                clouds, noises[k] = _with_noise(recording, name, wanted[drive][k], cut, config)
+                clouds, noises[k], in_rows = _with_noise(
+                    recording, name, wanted[drive][k], cut, config
+                )
+                without_rows |= set() if in_rows else {k}
                 reduced = partial(_stamped, partial(cut, noise=noises[k], keep_level=keep_level))
                 own: list[tuple[int, int, ScanPatches]] = []
                 for stamp_ns, patches in worked_together(reduced, clouds):
                     own.append((k, stamp_ns, patches))
                     advance()
                 scans.extend(sorted(own, key=lambda scan: scan[1]))
-            found.append(_together(drive, names, scans, guesses, noises))
+            of_drive = _together(drive, names, scans, guesses, noises)
+            found.append(replace(of_drive, without_rows=frozenset(without_rows)))
     return tuple(found)
 
 
@@ -256,11 +263,11 @@ def _with_noise(
     stamps_ns: IntArray,
     cut: Callable[..., ScanPatches],
     config: Config,
-) -> tuple[Iterator[LidarScan], RangeNoise]:
-    """The scans of a LiDAR, each read once, and its noise along the beam.
+) -> tuple[Iterator[LidarScan], RangeNoise, bool]:
+    """The scans of a LiDAR, each read once, its noise, and whether its beams are in rows.
 
-    The noise is that in some of them, which come first and are kept until it is known. `cut` gives
-    the patches of a scan.
+    The noise along the beam and the rows are those in some of them, which come first and are kept
+    until they are known. `cut` gives the patches of a scan.
 
     Raises:
         RecordingError: a cloud could not be read.
@@ -273,8 +280,9 @@ def _with_noise(
     freely = partial(cut, noise=RangeNoise.constant(OPEN_M), keep_level=True)
     found = list(worked_together(freely, first))
     noise = measured_noise(found, config.noise.lidar_range_m)
+    in_rows = any(found_rows(elevations(scan.points_lidar)) is not None for scan in first)
     rest = recording.scans(name, frozenset(stamps_ns.tolist()) - some)
-    return itertools.chain(_handed_over(first), rest), noise
+    return itertools.chain(_handed_over(first), rest), noise, in_rows
 
 
 def _handed_over(scans: list[LidarScan]) -> Iterator[LidarScan]:

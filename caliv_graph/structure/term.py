@@ -20,7 +20,7 @@ from caliv_graph.geometry.quadratic import without_errors
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.products import Array, IntArray, MountSlip, Strip, StructureTerm
 from caliv_graph.structure.align import align_patches
-from caliv_graph.structure.beams import CHANNEL_KINDS, beam_nodes, parts_of
+from caliv_graph.structure.beams import AZIMUTH, CHANNEL_KINDS, beam_nodes, parts_of
 from caliv_graph.structure.elimination import factor_of, half_solved
 from caliv_graph.structure.layout import Nuisances
 from caliv_graph.structure.patches import DrivePatches
@@ -268,6 +268,11 @@ FRAME_ARM_M = 5.0
 """Range at which a turn of the frame moves a surface by as much as its shift does."""
 
 
+LASERS = 4
+"""Lasers that take turns in a LiDAR whose beams are in no rows: Livox has 1 to 6. Each has an
+azimuth of its own, and the mean of all is a turn of the LiDAR about its axis that nothing shows."""
+
+
 def frame_sigmas(nuisances: Nuisances) -> Array:
     """(6,) 1 sigma of turn (rad) and shift (m) of the frame in which a LiDAR sees all strips."""
     tilts = nuisances.sighting_tilt
@@ -314,6 +319,8 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         on_ground=not above_m,
     )
     stated, frame = found.problem.standing, frame_sigmas(found.nuisances)
+    without_rows = sorted(found.problem.patches.without_rows)
+    turn_rad = found.problem.range_errors.beam_priors[AZIMUTH].usual / math.sqrt(LASERS)
     known, offset = prior.parameter_information, prior.parameter_offset
     b, held = system.b, [system.H]
     del found, system, prior
@@ -331,7 +338,9 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     if tilt is not None:
         tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
     frames = np.zeros((len(both), 6 * len(names)))
-    frames[len(keep) - frames.shape[1] : len(keep)] = np.diag(np.tile(frame, len(names)))
+    own_frames = np.tile(frame, (len(names), 1))
+    own_frames[without_rows, 2] = np.hypot(frame[2], turn_rad)
+    frames[len(keep) - frames.shape[1] : len(keep)] = np.diag(own_frames.ravel())
     both, both_gradient = without_errors(both, both_gradient, frames)
     now = state.errors[stand]
     stance = stance_of(stated, float(now[0]), both, both_gradient, tilt)

@@ -13,6 +13,7 @@ from caliv_graph.structure.channels import (
     ChannelSums,
     PointChannels,
     found_channels,
+    found_rows,
 )
 from caliv_graph.structure.patches import RangeNoise
 from caliv_graph.structure.planar import ScanPatches, SweepMotion, planar_patches
@@ -79,10 +80,15 @@ def test_a_rosette_and_a_lidar_of_many_channels_have_none() -> None:
     assert found_channels(rosette) is None
     for count in (30, 300, 3000):
         assert found_channels(rosette[:count]) is None
-    assert found_channels(drawn(np.linspace(-12.5, 12.5, MOST_CHANNELS + 1))) is None
+    many = drawn(np.linspace(-12.5, 12.5, 2 * MOST_CHANNELS))
+    assert found_channels(many) is None
+    assert found_rows(rosette) is None
+    rows = found_rows(many)
+    assert rows is not None
+    assert len(rows) == 2 * MOST_CHANNELS
     # Rows that bend with the azimuth, as those of a mirror that turns about one axis.
-    rows = drawn(np.linspace(-12.5, 12.5, 40)) + np.radians(1.5) * np.cos(a)
-    assert found_channels(rows) is None
+    bent = drawn(np.linspace(-12.5, 12.5, 40)) + np.radians(1.5) * np.cos(a)
+    assert found_channels(bent) is None
     assert found_channels(np.zeros(0)) is None
 
 

@@ -96,6 +96,7 @@ def test_patches_of_a_drive_lie_on_its_walls_each_at_its_own_time() -> None:
     assert patches.lidars == ("front", "top")
     assert (np.diff(patches.scan) >= 0).all()
     assert (np.diff(patches.scan_lidar) >= 0).all()
+    assert patches.without_rows == frozenset()
     for k, name in enumerate(patches.lidars):
         own = patches.stamps_ns[patches.scan_lidar == k]
         assert set(own.tolist()) <= set(stamps[name].tolist())

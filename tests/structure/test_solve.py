@@ -314,6 +314,19 @@ def test_the_frame_of_walls_and_ground_errs(solved: Solved) -> None:
     assert spread[1] == pytest.approx(known[1], abs=1e-6)
 
 
+def test_nothing_shows_the_mean_azimuth_of_a_lidar_without_rows(solved: Solved) -> None:
+    """The variance of its turn about its own axis is larger by 0.115 mrad over two, squared."""
+    motion = motion_of(solved)
+    patches = replace(solved.problem.patches, without_rows=frozenset({1}))
+    apart = replace(solved, problem=replace(solved.problem, patches=patches))
+    known, less = (information_of(term_of(of, np.arange(24)), motion) for of in (solved, apart))
+    loose = 1e-9 * np.diag(np.diag(known))  # the height is open
+    before, after = (np.linalg.inv(H + loose) for H in (known, less))
+    more = np.sqrt((after - before)[8, 8])
+    assert more == pytest.approx(0.5 * 1.15e-4, rel=0.03)
+    assert after[2, 2] == pytest.approx(before[2, 2], rel=1e-3)
+
+
 def test_a_term_says_nothing_against_itself(solved: Solved) -> None:
     information = term_of(solved, np.arange(0, 24, 3)).information
     scale = np.sqrt(np.maximum(np.diag(information), 1e-12))

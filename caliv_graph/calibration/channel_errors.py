@@ -43,14 +43,13 @@ def channel_sizes(
 
     Where in none they are those of their priors in `usual`, as where structure tells nothing.
     """
-    unknown_m, unknown_up_rad, unknown_aside_rad, *_ = (of.usual for of in usual.beam_priors)
+    unknown = np.array([prior.usual for prior in usual.beam_priors[:CHANNEL_KINDS]])
     out = {}
     for name in lidars:
-        own = [of_drive[name] for of_drive in found if name in of_drive]
-        out[name] = unknown_m, unknown_up_rad, unknown_aside_rad
-        if own:
-            range_m, elevation_rad, azimuth_rad = np.sqrt(np.square(own).mean(axis=0)).tolist()
-            out[name] = range_m, elevation_rad, azimuth_rad
+        known = [of_drive[name] for of_drive in found if name in of_drive]
+        own = np.array(known) if known else unknown[None]
+        range_m, elevation_rad, azimuth_rad = np.sqrt(np.square(own).mean(axis=0)).tolist()
+        out[name] = (range_m, elevation_rad, azimuth_rad)
     return out
 
 

@@ -233,14 +233,15 @@ def stack_clouds(
     lidar = _indices([cloud.lidar for cloud in observation.clouds])
     sigmas = np.full(int(lidar.max()) + 1, sigma_range_m)
     for cloud, sigma_m in zip(observation.clouds, sigmas[lidar].tolist(), strict=True):
-        kept, along = cloud.points_lidar, cloud.beams_lidar
+        kept = cloud.points_lidar
+        along = every = cloud.beams_lidar
         if len(kept) > max_points:
             some = np.sort(np.argsort(sampling_order(kept))[:max_points])
             kept, along = kept[some], along[some]
         points.append(kept)
         beams.append(along)
         if normals:
-            n, flat = surface_normals(kept, sigma_m, cloud.points_lidar, cloud.beams_lidar)
+            n, flat = surface_normals(kept, sigma_m, cloud.points_lidar, every)
         else:
             n, flat = np.zeros_like(kept), np.zeros(len(kept))
         normal.append(n)

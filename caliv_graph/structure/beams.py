@@ -71,7 +71,7 @@ def parts_of(beams: Sequence[BeamErrors]) -> Iterator[tuple[int, int, slice]]:
 
 
 def usual_sigmas(beams: Sequence[BeamErrors], ranges: RangeErrors) -> Array:
-    """(E,) 1 sigma of each error of the beams of all LiDARs, where nothing tells."""
+    """(E,) 1 sigma of each error of the beams of all LiDARs with which their estimate begins."""
     usual = [
         np.full(errors.nodes, ranges.beams[k]) for errors in beams for k in range(errors.kinds)
     ]

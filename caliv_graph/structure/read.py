@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 import gtsam
@@ -121,15 +120,15 @@ def read_patches(
                 clouds, noises[k], in_rows = _with_noise(
                     recording, name, wanted[drive][k], cut, config
                 )
-                without_rows |= set() if in_rows else {k}
+                if not in_rows:
+                    without_rows.add(k)
                 reduced = partial(_stamped, partial(cut, noise=noises[k], keep_level=keep_level))
                 own: list[tuple[int, int, ScanPatches]] = []
                 for stamp_ns, patches in worked_together(reduced, clouds):
                     own.append((k, stamp_ns, patches))
                     advance()
                 scans.extend(sorted(own, key=lambda scan: scan[1]))
-            of_drive = _together(drive, names, scans, guesses, noises)
-            found.append(replace(of_drive, without_rows=frozenset(without_rows)))
+            found.append(_together(drive, names, scans, guesses, noises, without_rows))
     return tuple(found)
 
 
@@ -353,8 +352,9 @@ def _together(
     scans: Sequence[tuple[int, int, ScanPatches]],
     moved_with: tuple[gtsam.Pose3, ...],
     noises: Mapping[int, RangeNoise],
+    without_rows: Collection[int] = (),
 ) -> DrivePatches:
-    """The patches of all scans (LiDAR, stamp, patches) of a drive, and the noise of LiDARs."""
+    """The patches of all scans (LiDAR, stamp, patches) of a drive, and what its LiDARs are like."""
     parts = [patches for _, _, patches in scans]
     number = [len(p.time_s) for p in parts]
     return DrivePatches(
@@ -371,4 +371,5 @@ def _together(
         moved_with=moved_with,
         channels=ChannelSums.joined([p.channels for p in parts], number),
         noise=noises,
+        without_rows=frozenset(without_rows),
     )

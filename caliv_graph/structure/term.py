@@ -22,7 +22,6 @@ from caliv_graph.products import Array, IntArray, MountSlip, Strip, StructureTer
 from caliv_graph.structure.align import align_patches
 from caliv_graph.structure.beams import AZIMUTH, CHANNEL_KINDS, beam_nodes, parts_of
 from caliv_graph.structure.elimination import factor_of, half_solved
-from caliv_graph.structure.layout import Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.prior import PosePrior
 from caliv_graph.structure.problem import Problem, relative_motions
@@ -273,11 +272,14 @@ LASERS = 4
 azimuth of its own, and the mean of all is a turn of the LiDAR about its axis that nothing shows."""
 
 
-def frame_sigmas(nuisances: Nuisances) -> Array:
-    """(6,) 1 sigma of turn (rad) and shift (m) of the frame in which a LiDAR sees all strips."""
-    tilts = nuisances.sighting_tilt
+def frame_sigmas(found: Solved) -> Array:
+    """(L, 6) 1 sigma of turn (rad) and shift (m) of the frame in which a LiDAR sees all strips."""
+    tilts, patches = found.nuisances.sighting_tilt, found.problem.patches
     turn_rad = FRAME_PART * float(np.median(tilts)) if len(tilts) else 0.0
-    return np.repeat([turn_rad, FRAME_ARM_M * turn_rad], 3)
+    out = np.tile(np.repeat([turn_rad, FRAME_ARM_M * turn_rad], 3), (len(patches.lidars), 1))
+    azimuth_rad = found.problem.range_errors.beam_priors[AZIMUTH].usual / math.sqrt(LASERS)
+    out[sorted(patches.without_rows), 2] = math.hypot(turn_rad, azimuth_rad)
+    return out
 
 
 def term_of(found: Solved, kept: IntArray) -> StructureTerm:
@@ -318,9 +320,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
         warnings=(_no_ground(found.problem.patches.drive, above_m),) if above_m else (),
         on_ground=not above_m,
     )
-    stated, frame = found.problem.standing, frame_sigmas(found.nuisances)
-    without_rows = sorted(found.problem.patches.without_rows)
-    turn_rad = found.problem.range_errors.beam_priors[AZIMUTH].usual / math.sqrt(LASERS)
+    stated, frame = found.problem.standing, frame_sigmas(found)
     known, offset = prior.parameter_information, prior.parameter_offset
     b, held = system.b, [system.H]
     del found, system, prior
@@ -338,9 +338,7 @@ def term_of(found: Solved, kept: IntArray) -> StructureTerm:
     if tilt is not None:
         tilt = MeanTilt(tilt.value + rows[:, -1], rows[:, :-1], tilt.cov + cov)
     frames = np.zeros((len(both), 6 * len(names)))
-    own_frames = np.tile(frame, (len(names), 1))
-    own_frames[without_rows, 2] = np.hypot(frame[2], turn_rad)
-    frames[len(keep) - frames.shape[1] : len(keep)] = np.diag(own_frames.ravel())
+    frames[len(keep) - frames.shape[1] : len(keep)] = np.diag(frame.ravel())
     both, both_gradient = without_errors(both, both_gradient, frames)
     now = state.errors[stand]
     stance = stance_of(stated, float(now[0]), both, both_gradient, tilt)

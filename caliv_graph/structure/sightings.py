@@ -124,7 +124,11 @@ def seen_ranges(moments: Array, origins: Array, normals: Array, starts: IntArray
     by_point = np.zeros((len(u), 1, 4))
     by_point[:, 0, :3] = -cos[:, None] * (u + cos[:, None] * normals) / distance
     by_point[:, 0, 3] = cos - np.einsum("ni,ni->n", by_point[:, 0, :3], middle)
-    return np.asarray(fitted_over(by_point, moments, normals, starts)[:, 0])
+    # About their mean: that of a sighting too short to show a slope is known all the same.
+    weight = moments[:, 3, 3, None, None]
+    mean = np.add.reduceat(weight * by_point, starts) / np.add.reduceat(weight, starts)
+    number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(moments)))
+    return np.asarray((mean + fitted_over(by_point - mean[number], moments, normals, starts))[:, 0])
 
 
 def sightings_of(

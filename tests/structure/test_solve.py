@@ -22,7 +22,6 @@ from caliv_graph.structure.jitter import Clocks
 from caliv_graph.structure.noise import ONE_VIEW_M, range_sigmas
 from caliv_graph.structure.problem import Problem, geometry_at, part_of
 from caliv_graph.structure.residuals import Geometry
-from caliv_graph.structure.slips import SAID_SIGMAS
 from caliv_graph.structure.solve import Solved, measured_slip, solve_structure
 from caliv_graph.structure.standing import Standing
 from caliv_graph.structure.system import System, system_of
@@ -144,7 +143,7 @@ def test_a_mount_that_slips_is_found(solved: Solved) -> None:
         assert (slip.lidars, slip.others) == ((name,), ())
         assert slip.since_s == pytest.approx(9 * STEP_NS * 1e-9)
         assert slip.lasts_s == pytest.approx(17 * STEP_NS * 1e-9)
-        assert slip.sigmas > 2.0 * SAID_SIGMAS  # 12.1 and 9.4
+        assert slip.sigmas > 10.0
         start = dict(zip(TRUE, found.state.T_vehicle_lidar, strict=True))
         measured = measured_slip(problem, start, slip)
         R = TRUE[name].rotation().matrix()

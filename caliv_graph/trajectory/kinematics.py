@@ -113,8 +113,10 @@ def means_over(
     1 over the window. `delay_s`: the windows are later by so much.
     """
     out = np.full((len(middles_ns), values.shape[1]), np.nan)
-    for i, middle in enumerate((middles_ns + round(1e9 * delay_s)).tolist()):
-        first, last = np.searchsorted(stamps_ns, [middle - HALF_WINDOW_NS, middle + HALF_WINDOW_NS])
+    middles = middles_ns + round(1e9 * delay_s)
+    begins = np.searchsorted(stamps_ns, middles - HALF_WINDOW_NS).tolist()
+    ends = np.searchsorted(stamps_ns, middles + HALF_WINDOW_NS).tolist()
+    for i, (middle, first, last) in enumerate(zip(middles.tolist(), begins, ends, strict=True)):
         if last - first < MIN_FIXES:
             continue
         x = (stamps_ns[first:last] - middle) / HALF_WINDOW_NS

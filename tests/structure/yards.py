@@ -157,41 +157,55 @@ def draw_patches(
                 seen &= (d < range_m) & (d > 1.0)
                 cos = ((t - p) @ normal) / d
                 seen &= cos > 0.26
-                for k in np.flatnonzero(seen):
-                    n = max(int(points * (15.0 / d[k]) ** 2 * cos[k]), 8)
-                    n = min(n, 300)
-                    q = p[k] + np.outer(rng.uniform(-0.5, 0.5, n) * patch_m, along)
-                    q[:, 2] += rng.uniform(-0.5, 0.5, n) * patch_m
-                    cu = ((q - centre) @ along / noise.bump_cell_m + 20).astype(int)
-                    cv = (q[:, 2] / noise.bump_cell_m).astype(int)
-                    own_error = common + pieces[int(U[k] // 2.0 + 20)]
-                    q += np.outer(cells[w][cu, cv] + own_error, normal)
-                    q_l = (q - t) @ R
-                    r = np.linalg.norm(q_l, axis=1)
-                    own_channel = channel_of(np.arcsin(q_l[:, 2] / r))
-                    long = bias + channels[own_channel]
-                    q_l *= (1.0 + (long + rng.standard_normal(n) * noise.range_m) / r)[:, None]
-                    h = np.column_stack([q_l, np.ones(n)])
-                    if noise.channel_m:
-                        of_channels.append(_sums(own_channel, q_l))
-                    c = q_l.mean(axis=0)
-                    values, vectors = np.linalg.eigh((q_l - c).T @ (q_l - c) / n)
-                    nu = vectors[:, 0]
-                    out["scan"].append(scan)
-                    out["moments"].append(h.T @ h)
-                    out["normal"].append(nu if nu @ c < 0 else -nu)
-                    out["scatter"].append(np.sqrt(values[0] * n / (n - 3.0)))
+                which = np.flatnonzero(seen)
+                if not len(which):
+                    continue
+                n = np.clip((points * (15.0 / d[which]) ** 2 * cos[which]).astype(int), 8, 300)
+                # Drawn patch by patch, the rest for all points of the wall at once.
+                drawn = [
+                    (rng.uniform(-0.5, 0.5, m), rng.uniform(-0.5, 0.5, m), rng.standard_normal(m))
+                    for m in n.tolist()
+                ]
+                beside, above, white = (np.concatenate(part) for part in zip(*drawn, strict=True))
+                first, of = np.cumsum(n) - n, np.repeat(which, n)
+                q = p[of] + np.outer(beside * patch_m, along)
+                q[:, 2] += above * patch_m
+                cu = ((q - centre) @ along / noise.bump_cell_m + 20).astype(int)
+                cv = (q[:, 2] / noise.bump_cell_m).astype(int)
+                own_error = common + pieces[(U[of] // 2.0 + 20).astype(int)]
+                q += np.outer(cells[w][cu, cv] + own_error, normal)
+                q_l = (q - t) @ R
+                r = np.linalg.norm(q_l, axis=1)
+                own_channel = channel_of(np.arcsin(q_l[:, 2] / r))
+                long = bias + channels[own_channel]
+                q_l *= (1.0 + (long + white * noise.range_m) / r)[:, None]
+                h = np.column_stack([q_l, np.ones(len(q_l))])
+                moments = np.add.reduceat(h[:, :, None] * h[:, None, :], first)
+                if noise.channel_m:
+                    of_channels += [
+                        _sums(own_channel[a : a + m], q_l[a : a + m])
+                        for a, m in zip(first.tolist(), n.tolist(), strict=True)
+                    ]
+                c = np.add.reduceat(q_l, first) / n[:, None]
+                off = q_l - np.repeat(c, n, axis=0)
+                spread = np.add.reduceat(off[:, :, None] * off[:, None, :], first)
+                values, vectors = np.linalg.eigh(spread / n[:, None, None])
+                nu = vectors[:, :, 0]
+                out["scan"].append(np.full(len(n), scan))
+                out["moments"].append(moments)
+                out["normal"].append(np.where((nu * c).sum(axis=1)[:, None] < 0.0, nu, -nu))
+                out["scatter"].append(np.sqrt(values[:, 0] * n / (n - 3.0)))
             scan += 1
     return DrivePatches(
         drive=0,
         lidars=tuple(extrinsics),
         stamps_ns=np.array(stamps, np.int64),
         scan_lidar=np.array(scan_lidar, np.int64),
-        scan=np.array(out["scan"], np.int64),
-        time_s=np.zeros(len(out["scan"])),
-        moments=np.array(out["moments"]),
-        normal_lidar=np.array(out["normal"]),
-        scatter_m=np.array(out["scatter"]),
+        scan=np.concatenate(out["scan"]).astype(np.int64),
+        time_s=np.zeros(sum(map(len, out["scan"]))),
+        moments=np.concatenate(out["moments"]),
+        normal_lidar=np.concatenate(out["normal"]),
+        scatter_m=np.concatenate(out["scatter"]),
         channels=ChannelSums.joined(of_channels, [1] * len(of_channels))
         if noise.channel_m
         else None,

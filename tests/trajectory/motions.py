@@ -91,32 +91,49 @@ class Course:
     def at(self, t: Array) -> Truth:
         """The state at (n,) seconds after the start."""
         h = 1e-3
-
-        def rotation(s: Array) -> Rotation:
-            rpy, _ = self._rpy_z(s)
-            return Rotation.from_euler("ZYX", rpy[:, ::-1])
-
-        def rates(s: Array) -> Array:
-            return np.asarray((rotation(s - h).inv() * rotation(s + h)).as_rotvec() / (2.0 * h))
+        # Angles and heights at five instants are all that the derivatives take.
+        before2, before, now, after, after2 = (self._rpy_z(t + k * h) for k in (-2, -1, 0, 1, 2))
 
         motion = self.drive.motion(np.round(1e9 * t).astype(np.int64))
-        _, z = self._rpy_z(t)
+        z, z_before, z_after = now[1], before[1], after[1]
         c, s = np.cos(motion.heading_rad), np.sin(motion.heading_rad)
         v, a = motion.speed_m_s, motion.acceleration_m_s2
         turn = v * v * motion.curvature_1_m
-        z_before, z_after = self._rpy_z(t - h)[1], self._rpy_z(t + h)[1]
         velocity = np.stack([v * c, v * s, (z_after - z_before) / (2 * h)], axis=1)
         acceleration = np.stack(
             [a * c - turn * s, a * s + turn * c, (z_after - 2 * z + z_before) / h**2], axis=1
         )
+        rates_before, rates, rates_after = (
+            _rates(middle[0], (last[0] - first[0]) / (2.0 * h))
+            for first, middle, last in (
+                (before2, before, now),
+                (before, now, after),
+                (now, after, after2),
+            )
+        )
         return Truth(
-            R_map_vehicle=np.asarray(rotation(t).as_matrix()),
+            R_map_vehicle=np.asarray(Rotation.from_euler("ZYX", now[0][:, ::-1]).as_matrix()),
             p_map_vehicle=np.column_stack([motion.xy_map, z]),
             velocity_map=velocity,
             acceleration_map=acceleration,
-            rates=rates(t),
-            rates_rate=(rates(t + h) - rates(t - h)) / (2.0 * h),
+            rates=rates,
+            rates_rate=(rates_after - rates_before) / (2.0 * h),
         )
+
+
+def _rates(rpy: Array, change: Array) -> Array:
+    """(n, 3) angular velocity in vehicle axes, of roll, pitch and yaw and what they change by."""
+    roll, pitch, _ = rpy.T
+    of_roll, of_pitch, of_yaw = change.T
+    across = np.cos(pitch) * of_yaw
+    return np.stack(
+        [
+            of_roll - np.sin(pitch) * of_yaw,
+            np.cos(roll) * of_pitch + np.sin(roll) * across,
+            np.cos(roll) * across - np.sin(roll) * of_pitch,
+        ],
+        axis=1,
+    )
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,11 @@ from caliv_graph.trajectory.states import States
 
 NoiseModel = gtsam.noiseModel.Base
 
+UNIT = np.eye(3)
+
+SKEW = np.array([skew(axis) for axis in UNIT]).transpose(1, 2, 0)
+"""`SKEW @ v` is `skew(v)`, in a third of the time: fixes and messages of wheels are many."""
+
 POSE_SIZE, ROTATION_SIZE = 6, 3
 """Coordinates of the tangent of a pose, and of a rotation."""
 
@@ -69,17 +74,16 @@ def _position_error(
     stays in pieces when they are gone.
     """
     offset_imu, shift, delay_s = known[:3], known[3:6], known[6]
-    T = values.atPose3(key_imu)
-    R = T.rotation().matrix()
+    T = values.atPose3(key_imu).matrix()  # one call of GTSAM: each takes as long as a product
+    R = T[:3, :3]
     if jacobians is not None:
-        x, y, z = offset_imu.tolist()
         J = np.empty((3, 6))
-        J[:, :3] = R @ np.array(((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0)))
+        J[:, :3] = R @ (SKEW @ -offset_imu)
         J[:, 3:] = R
         jacobians[0] = J
-        jacobians[1] = delay_s * np.eye(3)
+        jacobians[1] = delay_s * UNIT
     velocity = values.atVector(key_velocity)
-    return np.asarray(T.translation() + delay_s * velocity + R @ offset_imu + shift)
+    return np.asarray(T[:3, 3] + delay_s * velocity + R @ offset_imu + shift)
 
 
 def velocity_factor(
@@ -113,15 +117,11 @@ def _velocity_error(
 ) -> Array:
     """Residual (3,) of `velocity_factor`; `known` (4, 3) are k g D, and z."""
     gained, velocity_imu = known[:3], known[3]
-    back = values.atPose3(key_imu).rotation().matrix().T
+    back = values.atPose3(key_imu).matrix()[:3, :3].T
     moving, down = scale * (back @ values.atVector(key_velocity)), -back[:, 2]
     if jacobians is not None:
-        # `skew`, written out: there is one such factor per message of the wheels.
-        turned = []
-        for x, y, z in (moving.tolist(), down.tolist()):
-            turned.append(np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))))
         out = np.zeros((3, 6))
-        out[:, :3] = turned[0] + gained @ turned[1]
+        out[:, :3] = SKEW @ moving + gained @ (SKEW @ down)
         jacobians[0] = out
         jacobians[1] = scale * back
     return np.asarray(moving + gained @ down - velocity_imu)

@@ -34,12 +34,12 @@ from tests.trajectory.motions import (
     stamps,
 )
 
-COURSE = Course(eight_drive(18.0), rough=1.0)
+COURSE = Course(eight_drive(12.0), rough=1.0)
 SENSORS = replace(mounted_askew(), imu_hz=50.0, twist_hz=20.0, twist_delay_s=0.017)
 LONG = Course(eight_drive(24.0), rough=1.0)
 """Where fixes are late, accelerations of 18 s leave open by how much."""
 
-WANTED = stamps(18.0, 2.0, 0.0512)
+WANTED = stamps(12.0, 2.0, 0.0512)
 ARM: dict[str, object] = {"lever_arm": list(SENSORS.lever_arm), "lever_arm_sigma": 1e-7}
 
 

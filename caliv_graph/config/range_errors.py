@@ -196,13 +196,15 @@ def size_weights(
         priors: of the sizes.
     """
     information = 0.5 * (information + information.T)
+    if len(priors) == 1:
+        return _weights_of_one(information, pull, priors[0])
     # The kind with the most errors is integrated out on its own axes, at each of its sizes. What
     # is left is small.
     most = int(np.argmax(np.bincount(kinds, minlength=len(priors))))
     rest = [k for k in range(len(priors)) if k != most]
     grids = np.meshgrid(*(priors[k].sigmas for k in rest), indexing="ij")
     few, many = np.flatnonzero(kinds != most), np.flatnonzero(kinds == most)
-    sizes = np.stack(grids, axis=-1)[..., np.searchsorted(rest, kinds[few])] if rest else np.ones(0)
+    sizes = np.stack(grids, axis=-1)[..., np.searchsorted(rest, kinds[few])]
     values, axes = np.linalg.eigh(information[np.ix_(many, many)])
     values = np.maximum(values, 0.0)
     common, pulled = axes.T @ information[np.ix_(many, few)], axes.T @ pull[many]
@@ -217,6 +219,17 @@ def size_weights(
     for k, prior in enumerate(priors):
         cost += prior.cost.reshape([-1 if axis == k else 1 for axis in range(len(priors))])
     weights = np.exp(cost.min() - cost)
+    return np.asarray(weights / weights.sum())
+
+
+def _weights_of_one(information: Array, pull: Array, prior: SizePrior) -> Array:
+    """`size_weights` of errors of one kind, at all of its sizes at once."""
+    values, axes = np.linalg.eigh(information)
+    variances = prior.sigmas[:, None] ** 2
+    known = 1.0 + variances * np.maximum(values, 0.0)
+    costs = 0.5 * (np.log(known) - variances / known * (axes.T @ pull) ** 2).sum(axis=1)
+    costs += prior.cost
+    weights = np.exp(costs.min() - costs)
     return np.asarray(weights / weights.sum())
 
 

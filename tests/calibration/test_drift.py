@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import gtsam
@@ -85,6 +86,13 @@ def patches_of(*drives: int) -> tuple[DrivePatches, ...]:
     )
 
 
+@cache
+def with_fixes() -> SmoothedTrajectory:
+    """The same drive, its fixes and orientations too."""
+    _, config = speeds_alone()
+    return smooth_trajectory(record(COURSE, SENSORS, 3), config, WANTED)
+
+
 @pytest.fixture
 def drifting() -> SmoothedTrajectory:
     return smoothed_by_speeds()
@@ -92,13 +100,13 @@ def drifting() -> SmoothedTrajectory:
 
 def test_walls_tell_the_bias_of_a_drive_whose_heading_drifts(drifting: SmoothedTrajectory) -> None:
     _, config = speeds_alone()
-    fixed = smooth_trajectory(record(COURSE, SENSORS, 3), config, WANTED)
+    fixed = with_fixes()
     walls = Walls()
     evidence = StructureEvidence(patches_of(0, 1), errors=walls)
 
-    (with_fixes, without), told = about_walls([fixed, drifting], evidence, START, {}, config)
+    (same, without), told = about_walls([fixed, drifting], evidence, START, {}, config)
 
-    assert with_fixes is fixed
+    assert same is fixed
     assert isinstance(without, SmoothedTrajectory)
     assert np.median(without.states.gyro_bias[:, 2]) == pytest.approx(BIAS_RAD_S, abs=5e-4)
     # The second time nothing turns any more.
@@ -168,7 +176,7 @@ def test_a_heading_that_nothing_tells_is_refused(drifting: SmoothedTrajectory) -
 def test_other_drives_noise_leaves_it_where_walls_put_it(drifting: SmoothedTrajectory) -> None:
     """Fixes of another drive err over time: only that drive is smoothed again."""
     _, config = speeds_alone()
-    fixed = smooth_trajectory(record(COURSE, SENSORS, 3), config, WANTED)
+    fixed = with_fixes()
     true = COURSE.at(seconds(WANTED))
     there = about_poses(drifting, WANTED, true.R_map_vehicle, true.p_map_vehicle)
     error = CorrelatedError("gnss", (0.02, 0.02, 0.02), 10.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -13,6 +14,7 @@ from caliv_graph.products import Array, LidarScan, Trajectory
 from caliv_graph.trajectory.deskew import deskew, deskewed_with_origins
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.motions import (
     START_NS,
     Course,
@@ -94,13 +96,19 @@ def test_a_turn_by_hand() -> None:
     )
 
 
+@cache
+def rough_road(noise: float) -> tuple[Course, SmoothedTrajectory]:
+    """One smoothed drive for all places of a stamp within its sweep."""
+    course, sensors = Course(arc_drive(), rough=1.0), replace(mounted_askew(), noise=noise)
+    motion = record(course, sensors, 0)
+    return course, smooth_trajectory(motion, config_for(sensors), stamps(17.0, 10.0))
+
+
 @pytest.mark.parametrize("begin_s", [0.0, -0.05, -0.1], ids=["begin", "middle", "end"])
 @pytest.mark.parametrize(("noise", "rms_m"), [(0.0, 2e-4), (1.0, 4e-3)], ids=["exact", "noisy"])
 def test_a_sweep_on_a_rough_road(begin_s: float, noise: float, rms_m: float) -> None:
-    course, sensors = Course(arc_drive(), rough=1.0), replace(mounted_askew(), noise=noise)
-    motion = record(course, sensors, 0)
+    course, smoothed = rough_road(noise)
     stamp = START_NS + 8_000_000_000
-    smoothed = smooth_trajectory(motion, config_for(sensors), stamps(17.0, 10.0))
     scan, still = sweep(course, stamp, begin_s + np.linspace(0.0, 0.1, 4000))
     skewed = np.linalg.norm(scan.points_lidar - still, axis=1).max()
     moved = deskew(scan, MOUNTING, smoothed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from caliv_graph.products import MotionData
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.tilt import vehicle_tilt
 from tests.trajectory.motions import (
     Course,
@@ -110,14 +112,25 @@ def test_a_heading_from_north_is_told_before_any_scan_has_a_pose() -> None:
     assert "against the path of the GNSS fixes" in found.warning
 
 
+@cache
+def without_twist() -> MotionData:
+    return replace(record(EIGHT, mounted_askew(), 1), twist=None)
+
+
+@cache
+def at_every_stamp() -> SmoothedTrajectory:
+    wanted = stamps(EIGHT.duration_s, 10.0)
+    return smooth_trajectory(without_twist(), config_for(mounted_askew()), wanted)
+
+
 @pytest.mark.parametrize("wanted_hz", [0.0, 1.0], ids=["no-stamps", "some-stamps"])
 def test_heading_and_tilt_have_the_sigma_of_the_poses_whichever_are_wanted(
     wanted_hz: float,
 ) -> None:
     """Before any scan is looked at no stamps are wanted: poses are as uncertain as later."""
-    sensors, config = mounted_askew(), config_for(mounted_askew())
-    motion = replace(record(EIGHT, sensors, 1), twist=None)
-    every = smooth_trajectory(motion, config, stamps(EIGHT.duration_s, 10.0))
+    config = config_for(mounted_askew())
+    motion = without_twist()
+    every = at_every_stamp()
     some = stamps(EIGHT.duration_s, wanted_hz) if wanted_hz else ()
     few = smooth_trajectory(motion, config, some)
 

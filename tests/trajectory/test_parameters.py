@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from typing import Any, TypeVar
 
 import gtsam
@@ -36,6 +37,11 @@ SENSORS = replace(mounted_askew(), gnss_delay_s=0.033, twist_hz=50.0, twist_dela
 MOTION = record(COURSE, SENSORS, 1)
 WANTED = stamps(12.0, 2.0, 0.0512)
 CONFIG = config_for(SENSORS, robust={"kernel": "none"})
+
+
+@cache
+def unmoved() -> SmoothedTrajectory:
+    return smooth_trajectory(MOTION, CONFIG, WANTED)
 
 
 def smoothed_with(parameter: InputParameter, d: Array) -> SmoothedTrajectory:
@@ -112,7 +118,7 @@ def test_derivatives_are_whitened_as_the_residuals_are() -> None:
 def test_the_joint_gaussian_predicts_what_a_moved_parameter_does(
     parameter: InputParameter, d: Array
 ) -> None:
-    smoothed = with_parameters(smooth_trajectory(MOTION, CONFIG, WANTED), [parameter])
+    smoothed = with_parameters(unmoved(), [parameter])
 
     joint = smoothed.joint(WANTED, [parameter.name])
 

@@ -32,10 +32,11 @@ class World:
             normal = np.cross(a, b)
             slant = beams @ normal
             at = ((corner - origin) @ normal) / np.where(np.abs(slant) > 1e-9, slant, 1e-9)
-            hit = origin + at[:, None] * beams - corner
+            nearer = np.flatnonzero((at > 0.0) & (at < nearest))
+            hit = origin[nearer] + at[nearer, None] * beams[nearer] - corner
             u, v = hit @ a / (a @ a), hit @ b / (b @ b)
-            inside = (at > 0.0) & (u >= 0.0) & (u <= 1.0) & (v >= 0.0) & (v <= 1.0)
-            nearest = np.where(inside & (at < nearest), at, nearest)
+            inside = nearer[(u >= 0.0) & (u <= 1.0) & (v >= 0.0) & (v <= 1.0)]
+            nearest[inside] = at[inside]
         return nearest
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -158,15 +159,22 @@ class _Fit:
 
     Attributes:
         factor: (2,) real and imaginary part of force over acceleration.
-        cov: (2, 2) of it.
         squares: of the residuals and of the priors, (m/s^2)^2, independent samples.
         dof: number of independent samples.
+        variance: of a sample, (m/s^2)^2.
+        normal: (8, 8) information of all coefficients, in units of the variance.
     """
 
     factor: Array
-    cov: Array
     squares: float
     dof: float
+    variance: float
+    normal: Array
+
+    @cached_property
+    def cov(self) -> Array:
+        """(2, 2) of the factor; most fits are asked for their squares alone."""
+        return np.asarray((self.variance * np.linalg.pinv(self.normal))[:2, :2])
 
 
 def _regression(force: Complex, acceleration: Complex, along: Complex, swing: Complex) -> _Fit:
@@ -192,8 +200,7 @@ def _regression(force: Complex, acceleration: Complex, along: Complex, swing: Co
         left = y - A @ found
         variance = max(float(left @ left) / OVERLAP / dof, 1e-8)
     squares = float(left @ left) / OVERLAP + float(found @ prior @ found)
-    cov = variance * np.linalg.pinv(normal + prior)
-    return _Fit(found[:2], np.asarray(cov[:2, :2]), squares, dof)
+    return _Fit(found[:2], squares, dof, variance, normal + prior)
 
 
 def is_alone(chi2: Array) -> bool:

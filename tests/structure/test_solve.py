@@ -416,7 +416,7 @@ def test_one_estimate_at_a_time_has_residuals_and_none_while_surfaces_are_elimin
         systems.append(weakref.ref(out))
         return out
 
-    problem = problem_of(yard(), figure_eight(12), 1, jitter_s=jitter_s)
+    problem = problem_of(yard(), figure_eight(8), 1, jitter_s=jitter_s)
     problem = replace(problem, beam_nodes=beam_nodes(problem.patches))
     monkeypatch.setattr(solving, "geometry_at", geometry)
     monkeypatch.setattr(solving, "system_of", system)
@@ -430,7 +430,7 @@ def test_one_estimate_at_a_time_has_residuals_and_none_while_surfaces_are_elimin
 def test_residuals_of_some_sightings_at_a_time_are_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    problem = problem_of(yard(), figure_eight(12), 1)
+    problem = problem_of(yard(), figure_eight(6), 1)
     problem = replace(problem, beam_nodes=beam_nodes(problem.patches))
     found = solve(problem)
     of = found.problem, found.state, found.sightings, found.layout

@@ -4,6 +4,7 @@ import itertools
 import weakref
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import gtsam
@@ -120,9 +121,15 @@ def motion_of(found: Solved) -> Array:
     return found.problem.prior.at(found.state.moved)[0]
 
 
+@cache
+def in_yard() -> Solved:
+    """The drive that other files look at, too."""
+    return solve(problem_of(yard(), figure_eight(24), 1))
+
+
 @pytest.fixture(scope="module")
 def solved() -> Solved:
-    return solve(problem_of(yard(), figure_eight(24), 1))
+    return in_yard()
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.structure.solve import Solved, solve_structure
+from caliv_graph.structure.solve import Solved
 from caliv_graph.validation.clouds import Extrinsics
 from caliv_graph.validation.findings import PairTest, Verdict
 from caliv_graph.validation.solved_anew import pair_tests
 from caliv_graph.validation.verdict import CONTRADICTION
-from tests.structure.test_solve import problem_of
-from tests.structure.yards import TRUE, figure_eight, yard
+from tests.structure.test_solve import in_yard
+from tests.structure.yards import TRUE
 
 SIGMAS = np.array([1e-4] * 3 + [1e-3] * 3)
 COV = np.diag(np.tile(SIGMAS**2, 2))
@@ -22,10 +22,7 @@ COV = np.diag(np.tile(SIGMAS**2, 2))
 
 @pytest.fixture(scope="module")
 def used() -> Solved:
-    problem = problem_of(yard(), figure_eight(24), 1)
-    found = solve_structure(problem, dict(zip(TRUE, problem.guesses, strict=True)))
-    assert found is not None
-    return found
+    return in_yard()
 
 
 def compared(used: Solved, **moved: np.ndarray) -> PairTest:

@@ -189,29 +189,53 @@ def _propagated(
     density[0:3] = max(imu.gyroscope_sigma_rad_s * per_root_s, LEAST_SIGMA) ** 2
     density[6:9] = max(imu.accelerometer_sigma_m_s2 * per_root_s, LEAST_SIGMA) ** 2
     density[9:12], density[12:15] = force_walk**2, gyro_walk**2
+    at_step = np.rint((np.arange(SUBSTEPS)[:, None] + 0.5) * step * NANOSECONDS_PER_SECOND)
+    at = drive.states((nodes[:-1] + at_step.astype(np.int64)).ravel())
+    R = at.R_map_vehicle @ R_vehicle_imu
+    rate = at.angular_velocity
+    felt = at.acceleration_map + np.array([0.0, 0.0, scenario.gravity_m_s2])
+    force = np.einsum("nji,nj->ni", at.R_map_vehicle, felt)
+    force += np.cross(rate, np.cross(rate, arm))
+    turned, pushed = -skew(rate @ R_vehicle_imu), -R @ skew(force @ R_vehicle_imu)
     carried = np.broadcast_to(np.eye(STATE), (n - 1, STATE, STATE))
     cov = np.zeros((n - 1, STATE, STATE))
     for k in range(SUBSTEPS):
-        middle = nodes[:-1] + np.rint((k + 0.5) * step * NANOSECONDS_PER_SECOND).astype(np.int64)
-        at = drive.states(middle)
-        R = at.R_map_vehicle @ R_vehicle_imu
-        rate = at.angular_velocity
-        felt = at.acceleration_map + np.array([0.0, 0.0, scenario.gravity_m_s2])
-        force = np.einsum("nji,nj->ni", at.R_map_vehicle, felt)
-        force += np.cross(rate, np.cross(rate, arm))
-        F = np.zeros((n - 1, STATE, STATE))
-        F[:, 0:3, 0:3] = -skew(rate @ R_vehicle_imu)
-        F[:, 0:3, 12:15] = -np.eye(3)
-        F[:, 3:6, 6:9] = np.eye(3)
-        F[:, 6:9, 0:3] = -R @ skew(force @ R_vehicle_imu)
-        F[:, 6:9, 9:12] = -R
-        F *= step[:, None, None]
-        whole = np.eye(STATE) + F + 0.5 * F @ F
-        half = np.eye(STATE) + 0.5 * F
-        noise = (half * (density * step[:, None])[:, None, :]) @ np.swapaxes(half, 1, 2)
+        own = slice(k * (n - 1), (k + 1) * (n - 1))
+        whole, half = _transitions(turned[own], pushed[own], R[own], step)
+        noise = (half * (density * step[:, None])[:, None]) @ _transposed(half)
         carried = whole @ carried
-        cov = whole @ cov @ np.swapaxes(whole, 1, 2) + noise
+        cov = whole @ cov @ _transposed(whole) + noise
     return carried, cov
+
+
+def _transitions(turned: Array, pushed: Array, R: Array, step_s: Array) -> tuple[Array, Array]:
+    """(n, 15, 15) transition matrices over steps (n,) to second order, and over half to first.
+
+    With F of `_propagated`: its blocks of the rotation, (n, 3, 3) of the rotation and of the
+    velocity, and the attitudes. Most blocks of F and of its square are zero.
+    """
+    n, h = len(step_s), step_s[:, None, None]
+    A, B, C = turned * h, pushed * h, -R * h
+    eye = np.eye(3)
+    whole = np.broadcast_to(np.eye(STATE), (n, STATE, STATE)).copy()
+    half = whole.copy()
+    for out, part in ((whole, 1.0), (half, 0.5)):
+        out[:, 0:3, 0:3] += part * A
+        out[:, 0:3, 12:15] = -part * h * eye
+        out[:, 3:6, 6:9] = part * h * eye
+        out[:, 6:9, 0:3] = part * B
+        out[:, 6:9, 9:12] = part * C
+    whole[:, 0:3, 0:3] += 0.5 * A @ A
+    whole[:, 0:3, 12:15] -= 0.5 * h * A
+    whole[:, 3:6, 0:3] = 0.5 * h * B
+    whole[:, 3:6, 9:12] = 0.5 * h * C
+    whole[:, 6:9, 0:3] += 0.5 * B @ A
+    whole[:, 6:9, 12:15] = -0.5 * h * B
+    return whole, half
+
+
+def _transposed(matrices: Array) -> Array:
+    return np.swapaxes(matrices, 1, 2)
 
 
 def _add_aiding(diagonal: Array, drive: Route, nodes: IntArray, scenario: Scenario) -> None:

@@ -121,6 +121,14 @@ class LidarHistory:
             return self.places(alignment, self._base, self.scan_of)
         return self.places(alignment, self._base[which], self.scan_of[which])
 
+    def base_terms(self, which: BoolArray) -> Array:
+        """(n, 2, 5) x and y of `bases`, by the factors 1, cos yaw, sin yaw and shift x, y."""
+        R = self.R_map_vehicle[self.scan_of[which]][:, :2]
+        ahead, left, up = (R[:, :, axis] for axis in range(3))
+        x, y, z = (self._base[which] @ self._R_guess.T).T[:, :, None]
+        fixed = R @ self.t_vehicle_lidar + self.t_map_vehicle[self.scan_of[which], :2] + up * z
+        return np.stack([fixed, ahead * x + left * y, left * x - ahead * y, ahead, left], axis=-1)
+
     def outlines(self, which: BoolArray, alignment: Alignment) -> tuple[Array, IntArray]:
         """Points (m, 3) of these objects in the map, and the scan of each."""
         chosen = np.flatnonzero(which)

@@ -388,6 +388,8 @@ def test_ground_without_walls_is_told_cell_by_cell() -> None:
 def test_a_lidar_that_sees_ground_alone_is_not_taken_as_known() -> None:
     """It knows the ground no better than its own mounting; taken as known it halved S2V roll."""
     scenario = load_scenario(SCENARIOS / "paper_arc.yaml")
+    few = {n: lidar.model_copy(update={"rate_hz": 2.0}) for n, lidar in scenario.lidars.items()}
+    scenario = scenario.model_copy(update={"lidars": few})
     down = scenario.lidars["rear"].model_copy(update={"vertical_fov_deg": (-60.0, -40.0)})
     front = scenario.model_copy(update={"lidars": {"front": scenario.lidars["front"]}})
     both = scenario.model_copy(update={"lidars": {**front.lidars, "rear": down}})

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
 from caliv_graph.cli.main import app, run
+from caliv_graph.config.model import Config
+from caliv_graph.pipeline import Prepared, prepare
 from caliv_graph.simulation.simulate import write_drive as write_simulated
 from tests.cli.commands import write_config, write_drive
 from tests.workflows.test_survey import scenario_of
@@ -32,6 +36,26 @@ def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def kept() -> list[Prepared]:
+    """The stages before the graph, of the arc."""
+    return []
+
+
+@pytest.fixture
+def prepared_once(kept: list[Prepared], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The drive is the same in several commands, which differ in what their configs require."""
+
+    def once(recordings: Any, config: Config, motions: Any, progress: Any) -> Prepared:
+        if not kept:
+            kept.append(prepare(recordings, config, motions, progress))
+        required = kept[0].config.model_copy(update={"require": config.require})
+        return replace(kept[0], config=required)
+
+    monkeypatch.setattr("caliv_graph.workflows.survey.prepare", once)
+
+
+@pytest.mark.usefixtures("prepared_once")
 def test_an_arc_as_json(arc: Path) -> None:
     result = observability(arc / "config.yaml", "--data", arc / "drive", "--json")
 
@@ -70,6 +94,7 @@ def test_zeros_of_a_draft_are_no_guesses(
     assert "or 'initial: null': then they are found from the drive" in told
 
 
+@pytest.mark.usefixtures("prepared_once")
 def test_in_words_and_with_exit_3_where_the_config_wants_more(arc: Path, tmp_path: Path) -> None:
     raw = yaml.safe_load((arc / "config.yaml").read_text())
     raw |= {"require": ["s2s", "s2v_rotation"], "data": {"path": str(arc / "drive")}}

@@ -15,7 +15,7 @@ from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import ConfigError
-from caliv_graph.products import Array, LidarScan, Recording, TargetObservation
+from caliv_graph.products import Array, LidarScan, Recording, TargetCloud, TargetObservation
 from caliv_graph.scenario.drive_models import ArcDrive
 from caliv_graph.scenario.model import InitialGuessModel, SuspensionModel
 from caliv_graph.scenario.sensor_models import EdgeModel, LidarModel, SweepModel
@@ -113,6 +113,10 @@ def smoothed() -> Sequence[VehicleTrajectory]:
     return smooth_trajectories([whole], config_for(whole), [[]])
 
 
+def points_of(cloud: LidarScan | TargetCloud) -> set[tuple[float, ...]]:
+    return set(map(tuple, cloud.points_lidar.tolist()))
+
+
 def observed(recording: SimulatedRecording) -> TargetObservation:
     recordings: list[Recording] = [recording]
     config, trajectories = config_for(recording), smoothed()
@@ -140,7 +144,7 @@ def test_without_noise_the_target_has_the_same_points() -> None:
     )
     assert np.abs(counts[:, 0] - counts[:, 1]).max() <= 0.03 * counts.max()
     for a, b in zip(whole.clouds, thinned.clouds, strict=True):
-        common = {tuple(p) for p in a.points_lidar} & {tuple(p) for p in b.points_lidar}
+        common = points_of(a) & points_of(b)
         assert len(common) >= 0.95 * len(a.points_lidar)
 
 
@@ -160,13 +164,13 @@ def test_the_beams_that_are_kept_return_what_whole_clouds_do() -> None:
             whole.scans_with_truth(name, wanted), thin.scans_with_truth(name), strict=True
         ):
             assert a.scan.stamp_ns == b.scan.stamp_ns
-            points = {tuple(p) for p in b.scan.points_lidar}
-            assert points.issubset(tuple(p) for p in a.scan.points_lidar)
+            points = points_of(b.scan)
+            assert points <= points_of(a.scan)
             (T_map_vehicle,) = whole.truth.T_map_vehicle(np.array([a.scan.stamp_ns]))
             at_map = T_map_vehicle.compose(T_vehicle_lidar).transformFrom(a.scan.points_lidar.T).T
             inside = ((at_map > low - margin_m) & (at_map < high + margin_m)).all(axis=1)
             things = a.scan.points_lidar[inside & (a.objects != 0)]
-            assert points.issuperset(tuple(p) for p in things)
+            assert points >= set(map(tuple, things.tolist()))
             walked += int((inside & (a.objects == walker)).sum())
     assert walked > 100
 

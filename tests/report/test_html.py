@@ -108,6 +108,12 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Ran:
 
 
 @pytest.fixture(scope="module")
+def html(bag: Ran) -> str:
+    """Its page."""
+    return bag.page()
+
+
+@pytest.fixture(scope="module")
 def staged(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """Given poses, no ground, and the paper's two stages."""
     scenario = paper_scenario(rate_hz=1.25, position_sigma_m=0.005, rotation_sigma_rad=1e-3)
@@ -304,8 +310,8 @@ def test_why_a_cloud_is_believed_less(bag: Ran) -> None:
 # ------------------------------------------------------------------ page
 
 
-def test_verdict_first_and_nothing_undetermined_looks_like_a_value(bag: Ran) -> None:
-    page = Page(bag.page())
+def test_verdict_first_and_nothing_undetermined_looks_like_a_value(html: str) -> None:
+    page = Page(html)
 
     start = page.text[: page.text.index("Sensor to vehicle")]
     assert "partial Calibrated in part" in start
@@ -321,9 +327,7 @@ def test_verdict_first_and_nothing_undetermined_looks_like_a_value(bag: Ran) -> 
     assert values.count("not determined") == 4 + len(AXES)
 
 
-def test_names_do_not_run(bag: Ran) -> None:
-    html = bag.page()
-
+def test_names_do_not_run(html: str) -> None:
     page = Page(html)
     assert EVIL in page.text
     assert EVIL_FOLDER in page.text
@@ -350,9 +354,7 @@ def test_long_names_are_short_in_figures_only_while_they_differ() -> None:
     assert labels(["<b>&"]) == {"<b>&": "&lt;b&gt;&amp;"}
 
 
-def test_it_asks_for_nothing_and_is_small(bag: Ran) -> None:
-    html = bag.page()
-
+def test_it_asks_for_nothing_and_is_small(html: str) -> None:
     assert set(Page(html).loads) <= {"data:,"}
     assert "default-src 'none'" in html
     assert len(html.encode()) < MOST_BYTES
@@ -618,8 +620,7 @@ def test_the_browser_would_tell(tmp_path: Path) -> None:
     assert "http://127.0.0.1:9/a.png" in told.requests
 
 
-def test_every_figure_is_drawn_without_network_or_complaint(bag: Ran, tmp_path: Path) -> None:
-    html = bag.page()
+def test_every_figure_is_drawn_without_network_or_complaint(html: str, tmp_path: Path) -> None:
     figures = set(re.findall(r'id="figure-(\w+)"', html))
 
     told = shown(html, tmp_path)

@@ -1,5 +1,6 @@
 """IMU, GNSS and velocity against the laws of motion, and their noise against what is stated."""
 
+import itertools
 import math
 from typing import Any
 
@@ -105,25 +106,19 @@ def enu_of(recording: SimulatedRecording) -> Array:
     return np.column_stack(enu)
 
 
-def integrated(imu: ImuSamples, R: Array, t: Array, v: Array) -> tuple[list[Array], list[Array]]:
+def integrated(imu: ImuSamples, R: Array, t: Array, v: Array) -> tuple[Array, Array]:
     """Orientations and positions of the IMU in the map from what it says and a start alone."""
-    rotations, positions = [R], [t]
-    times_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    for k, dt in enumerate(np.diff(times_s)):
-        rate = 0.5 * (imu.angular_velocity[k] + imu.angular_velocity[k + 1])
-        # The second order of what two rates that differ do (coning).
-        turn = (
-            rate * dt + np.cross(imu.angular_velocity[k], imu.angular_velocity[k + 1]) * dt**2 / 12
-        )
-        R_next = R @ Rotation.from_rotvec(turn).as_matrix()
-        felt = 0.5 * (R @ imu.specific_force[k] + R_next @ imu.specific_force[k + 1])
-        acceleration = felt - [0.0, 0.0, GRAVITY]
-        t = t + v * dt + 0.5 * acceleration * dt**2
-        v = v + acceleration * dt
-        R = R_next
-        rotations.append(R)
-        positions.append(t)
-    return rotations, positions
+    dt = np.diff((imu.stamps_ns - imu.stamps_ns[0]) * 1e-9)[:, None]
+    before, after = imu.angular_velocity[:-1], imu.angular_velocity[1:]
+    # The second order of what two rates that differ do (coning).
+    turns = 0.5 * (before + after) * dt + np.cross(before, after) * dt**2 / 12
+    steps = Rotation.from_rotvec(turns).as_matrix()
+    rotations = np.array(list(itertools.accumulate(steps, np.matmul, initial=R)))
+    force_map = np.einsum("nij,nj->ni", rotations, imu.specific_force)
+    acceleration = 0.5 * (force_map[:-1] + force_map[1:]) - [0.0, 0.0, GRAVITY]
+    velocities = v + np.vstack([np.zeros(3), np.cumsum(acceleration * dt, axis=0)])
+    moves = velocities[:-1] * dt + 0.5 * acceleration * dt**2
+    return rotations, t + np.vstack([np.zeros(3), np.cumsum(moves, axis=0)])
 
 
 @pytest.mark.parametrize("name", DRIVES)
@@ -143,9 +138,9 @@ def test_perfect_imu_integrated_from_the_true_start_follows_the_whole_drive(
     # It starts from standstill.
     rotations, positions = integrated(imu, R_true[0], t_true[0], np.zeros(3))
 
-    turns = Rotation.from_matrix(np.swapaxes(R_true, 1, 2) @ np.array(rotations)).magnitude()
+    turns = Rotation.from_matrix(np.swapaxes(R_true, 1, 2) @ rotations).magnitude()
     assert turns.max() < 1e-4
-    assert np.linalg.norm(np.array(positions) - t_true, axis=1).max() < 0.01
+    assert np.linalg.norm(positions - t_true, axis=1).max() < 0.01
     assert imu.orientation_xyzw is not None
     said = Rotation.from_quat(imu.orientation_xyzw).as_matrix()
     np.testing.assert_allclose(said, R_true, atol=1e-12)

@@ -140,12 +140,24 @@ def _attributes() -> Counter[tuple[str, str]]:
     )
 
 
+@functools.cache
+def _loaded(node: ast.AST) -> Counter[str]:
+    """How often each name is read in a piece of text: many constants are looked for in it."""
+    return Counter(
+        n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)
+    )
+
+
 def _loads(node: ast.AST, name: str) -> int:
     """How often a name is read in a piece of text."""
-    return sum(
-        isinstance(n, ast.Name) and n.id == name and isinstance(n.ctx, ast.Load)
-        for n in ast.walk(node)
-    )
+    return _loaded(node)[name]
+
+
+@functools.cache
+def _functions(module: str) -> list[ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda]:
+    """The functions of a module, those within others included."""
+    kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
+    return [node for node in ast.walk(_trees()[module]) if isinstance(node, kinds)]
 
 
 def _reads(place: Place) -> int:
@@ -155,14 +167,13 @@ def _reads(place: Place) -> int:
         UnreachableError: a function took it at import, as a default argument or in a decorator.
     """
     count = 0
-    for function in ast.walk(_trees()[place.module]):
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            defaults = [*function.args.defaults, *filter(None, function.args.kw_defaults)]
-            taken = [*defaults, *getattr(function, "decorator_list", [])]
-            if any(_loads(node, place.name) for node in taken):
-                raise UnreachableError(
-                    f"{place.module}.{place.name} is taken at import, line {function.lineno}"
-                )
+    for function in _functions(place.module):
+        defaults = [*function.args.defaults, *filter(None, function.args.kw_defaults)]
+        taken = [*defaults, *getattr(function, "decorator_list", [])]
+        if any(_loads(node, place.name) for node in taken):
+            raise UnreachableError(
+                f"{place.module}.{place.name} is taken at import, line {function.lineno}"
+            )
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
             count += sum(_loads(statement, place.name) for statement in function.body)
     return count + _attributes()[place.module.rpartition(".")[2], place.name]

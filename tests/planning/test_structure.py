@@ -221,7 +221,7 @@ def test_a_suggestion_counts_the_walls_of_a_recorded_drive() -> None:
     chair = WorldModel(objects={"chair": ChairModel(xy_m=(0.0, 0.0))}, targets=("chair",))
     vehicle = scenario.model_copy(update={"world": chair})
 
-    alone = suggest(vehicle, {}, Assumptions())
+    alone = suggest(vehicle, {}, Assumptions(structure=False))
     beside = suggest(vehicle, {}, Assumptions(), [recorded])
 
     assert alone is not None

@@ -28,7 +28,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.products import GroundObservation, Registration, TargetObservation
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.registration.self_comparison import views_of
-from caliv_graph.registration.symmetry import Symmetry, alarming, symmetries
+from caliv_graph.registration.symmetry import Symmetry, alarming, alarming_orders, symmetries
 from caliv_graph.wording.offsets import undetermined_offset_sentences
 from caliv_graph.wording.symmetries import symmetry_sentence
 
@@ -144,8 +144,9 @@ def symmetries_of_targets(
     turns: list[Symmetry | None] = []
     warnings = []
     sigma = max(max(lidar.sigma.rpy_rad()) for lidar in config.lidars.values())
+    noise_m, orders = config.noise.lidar_range_m, alarming_orders(sigma)
     for registration in registrations:
-        found = symmetries(registration.mixture, views_of(registration), config.noise.lidar_range_m)
+        found = symmetries(registration.mixture, views_of(registration), noise_m, orders)
         turns.append(next((s for s in found if s.continuous and s.upright), None))
         warnings += [
             symmetry_sentence(s, registration.observation.name, sigma)

@@ -91,21 +91,21 @@ class Symmetry:
 
 
 def symmetries(
-    mixture: Mixture, views: Sequence[View], sigma_range_m: float
+    mixture: Mixture, views: Sequence[View], sigma_range_m: float, orders: Sequence[int]
 ) -> tuple[Symmetry, ...]:
     """Rotations after which a reconstructed shape looks the same: the smallest of each axis.
 
     Tested axes: the vertical, first, and the two main horizontal directions of its surfaces. Tested
-    rotations about each: `BETWEEN_DEG` for a continuous symmetry, `ORDERS` for the others. A
-    component contradicts a rotation if beams of the `views` (`self_comparison.views_of`) pass
-    through its rotated place, or end elsewhere by more than the noise. Places that no beam came
-    near are listed (`Symmetry.unseen`).
+    rotations about each: `BETWEEN_DEG` for a continuous symmetry, those of `orders`, some of
+    `ORDERS`, for the others. A component contradicts a rotation if beams of the `views`
+    (`self_comparison.views_of`) pass through its rotated place, or end elsewhere by more than the
+    noise. Places that no beam came near are listed (`Symmetry.unseen`).
     """
     if not views or len(mixture.weights) < 20:
         return ()
     shape = Shape(mixture, views, sigma_range_m)
     identity = shape.compare(np.eye(3), np.zeros(3))
-    found = shared_map(lambda axis: _symmetry_about(shape, axis, identity), _axes(mixture))
+    found = shared_map(lambda axis: _symmetry_about(shape, axis, identity, orders), _axes(mixture))
     return tuple(symmetry for symmetry in found if symmetry is not None)
 
 
@@ -151,7 +151,21 @@ def marginalise_symmetry(H: Array, gradient: Array, symmetry: Symmetry) -> tuple
 
 def alarming(symmetry: Symmetry, sigma_rad: float) -> bool:
     """Whether a symmetry can bias a calibration whose guesses have this sigma of rotation (rad)."""
-    return symmetry.continuous or 3.0 * sigma_rad >= 0.5 * symmetry.angle_rad
+    return symmetry.continuous or _confused(symmetry.angle_rad, sigma_rad)
+
+
+def alarming_orders(sigma_rad: float) -> tuple[int, ...]:
+    """Those of `ORDERS` that are `alarming` at this sigma (rad), and those that they imply.
+
+    At the sigmas of usual guesses it is none of them: no time is spent on what is not reported.
+    """
+    confused = [order for order in ORDERS if _confused(2.0 * math.pi / order, sigma_rad)]
+    return tuple(order for order in ORDERS if any(other % order == 0 for other in confused))
+
+
+def _confused(angle_rad: float, sigma_rad: float) -> bool:
+    """Whether a guess with this sigma may be nearer to a place that is rotated by an angle."""
+    return 3.0 * sigma_rad >= 0.5 * angle_rad
 
 
 def _axes(mixture: Mixture) -> list[Array]:
@@ -167,15 +181,17 @@ def _axes(mixture: Mixture) -> list[Array]:
     return [np.array([0.0, 0.0, 1.0]), np.array([c, s, 0.0]), np.array([-s, c, 0.0])]
 
 
-def _symmetry_about(shape: Shape, axis: Array, identity: Comparison) -> Symmetry | None:
+def _symmetry_about(
+    shape: Shape, axis: Array, identity: Comparison, orders: Sequence[int]
+) -> Symmetry | None:
     """The smallest rotation about an axis that is a symmetry, or None."""
     limit = identity.contradicted + MOST_CONTRADICTED
     least = FEWEST_COMPARED * identity.compared
 
-    def worse_of_both(angle_rad: float, enough: float = math.inf) -> RotationResult | None:
+    def worse_of_both(angle_rad: float) -> RotationResult | None:
         """A rotation and its inverse, the more contradicted one; None if either is hardly seen.
 
-        If the first is contradicted by more than `enough`, the inverse is not tried.
+        If the first is contradicted by more than the limit, the inverse is not tried.
         """
         worst: RotationResult | None = None
         for signed in (angle_rad,) if angle_rad == math.pi else (angle_rad, -angle_rad):
@@ -184,7 +200,7 @@ def _symmetry_about(shape: Shape, axis: Array, identity: Comparison) -> Symmetry
                 return None
             if worst is None or result.comparison.contradicted > worst.comparison.contradicted:
                 worst = result
-            if result.comparison.contradicted > enough:
+            if result.comparison.contradicted > limit:
                 break
         return worst
 
@@ -202,11 +218,11 @@ def _symmetry_about(shape: Shape, axis: Array, identity: Comparison) -> Symmetry
         wide = max(passed, key=lambda r: abs(r.angle_rad))
         return _symmetry(replace(worst, axis=wide.axis, centre=wide.centre), 0.0, wide.angle_rad)
     smallest, refuted = None, set[int]()
-    for order in sorted(ORDERS):
+    for order in sorted(orders):
         # A symmetry of order 4 is one of order 2: where 180 degrees are refuted, so are 90.
         if any(order % part == 0 for part in refuted):
             continue
-        result = worse_of_both(2.0 * math.pi / order, limit)
+        result = worse_of_both(2.0 * math.pi / order)
         if result is not None and result.comparison.contradicted > limit:
             refuted.add(order)
         elif result is not None:

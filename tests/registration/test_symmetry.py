@@ -16,8 +16,10 @@ from caliv_graph.products import Array, Registration
 from caliv_graph.registration.register import FINE_SIGMA_M, JointRegistration
 from caliv_graph.registration.self_comparison import Shape, View, ViewIndex, views_of
 from caliv_graph.registration.symmetry import (
+    ORDERS,
     Symmetry,
     alarming,
+    alarming_orders,
     marginalise_symmetry,
     refit,
     symmetries,
@@ -81,7 +83,7 @@ def seen(name: str, azimuths_deg: Sequence[float], seed: int = 0) -> Registratio
 
 
 def found(registration: Registration) -> tuple[Symmetry, ...]:
-    return symmetries(registration.mixture, views_of(registration), SIGMA_M)
+    return symmetries(registration.mixture, views_of(registration), SIGMA_M, ORDERS)
 
 
 @cache
@@ -190,7 +192,7 @@ def test_one_view_against_expected_surfaces(whole: bool) -> None:
 
 
 def test_a_shape_without_views_has_no_symmetry() -> None:
-    assert symmetries(seen("cube", ALL_AROUND).mixture, (), SIGMA_M) == ()
+    assert symmetries(seen("cube", ALL_AROUND).mixture, (), SIGMA_M, ORDERS) == ()
 
 
 # ------------------------------------------------------------------ what it means
@@ -273,3 +275,14 @@ def test_a_symmetry_is_alarming_if_guesses_may_be_off_by_half_its_turn() -> None
     assert alarming(drum, sigma)
     assert not alarming(cube, sigma)
     assert alarming(cube, math.radians(20.0))
+
+
+@pytest.mark.parametrize(
+    ("sigma_deg", "orders"),
+    [(3.0, ()), (7.6, (2, 4, 8)), (10.1, (2, 3, 4, 6, 8)), (12.1, ORDERS), (60.0, ORDERS)],
+)
+def test_orders_that_guesses_may_confuse_are_tested_with_their_parts(
+    sigma_deg: float, orders: tuple[int, ...]
+) -> None:
+    """Three sigmas reach half of an eighth of a turn at 7.5 degrees, of a fifth at 12."""
+    assert alarming_orders(math.radians(sigma_deg)) == orders

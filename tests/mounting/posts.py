@@ -64,7 +64,7 @@ class Drive:
 
     def scan_stamps_ns(self, lidar: str) -> Sequence[int]:
         begin, end = self.way.span_ns
-        return list(range(begin + 200_000_000, end - 200_000_000, 700_000_000))
+        return list(range(begin + 200_000_000, end - 200_000_000, 1_400_000_000))
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         for stamp in self.scan_stamps_ns(lidar):

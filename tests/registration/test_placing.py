@@ -22,7 +22,7 @@ GUESS_SIGMAS = np.array([[math.radians(3.0), 0.06]])
 
 
 def seen_from(T_target_lidar: gtsam.Pose3, rng: np.random.Generator) -> Array:
-    """(500, 3) points of the faces of the box that a LiDAR sees, in its frame."""
+    """(300, 3) points of the faces of the box that a LiDAR sees, in its frame."""
     p = rng.uniform(-1.0, 1.0, (6000, 3)) * HALF
     face = rng.choice(2, len(p), p=[0.8, 0.2])
     side = np.sign(T_target_lidar.translation()[1 - face])
@@ -30,7 +30,7 @@ def seen_from(T_target_lidar: gtsam.Pose3, rng: np.random.Generator) -> Array:
     place = T_target_lidar.translation()
     # Hardly anything comes back from a face at a grazing angle.
     visible = np.abs(place[1 - face]) > np.maximum(HALF[1 - face], 0.3 * np.hypot(*place[:2]))
-    points = p[visible][:500]
+    points = p[visible][:300]
     return np.asarray(T_target_lidar.transformTo(points.T).T)
 
 
@@ -86,7 +86,7 @@ def test_a_wide_box_seen_from_all_around_keeps_its_faces_apart() -> None:
     """With their middles together, front and back were registered on each other."""
     rng = np.random.default_rng(3)
     true = all_around()
-    clouds = [seen_from(T, rng) + rng.normal(0.0, 0.003, (500, 3)) for T in true]
+    clouds = [seen_from(T, rng) + rng.normal(0.0, 0.003, (300, 3)) for T in true]
     wrong = gtsam.Pose3(gtsam.Rot3.Ypr(0.04, 0.0, 0.0), np.array([0.05, 0.05, 0.0]))
     state = JointRegistration(observe(clouds), config_of(lidar_range_m=0.003))
 

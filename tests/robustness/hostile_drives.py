@@ -44,6 +44,7 @@ SCENARIO: Mapping[str, Any] = {
     },
     "crop": {"margin_m": 1.0, "elsewhere_stride": 16},
     "imu": {"rate_hz": 50.0},
+    "velocity": {"rate_hz": 5.0},
 }
 
 QUICK: Mapping[str, Any] = {

@@ -49,7 +49,7 @@ class Drive:
 
 
 def swept_and_noisy() -> Scenario:
-    """`noisy` in two thirds of its time, with the sweeps of `distorted` and half of its clouds."""
+    """`noisy` in two thirds of its time, swept as `distorted`, with half of clouds and fixes."""
     noisy = load_scenario(SCENARIOS / "noisy.yaml")
     distorted = load_scenario(SCENARIOS / "distorted.yaml")
     lidars = {}
@@ -62,7 +62,10 @@ def swept_and_noisy() -> Scenario:
     crop = noisy.crop.model_copy(update={"elsewhere_stride": 16})
     course = noisy.drive.model_copy(update={"speed_m_s": 3.0, "radius_m": 6.0})
     imu = noisy.imu.model_copy(update={"rate_hz": 50.0})
-    changes = {"drive": course, "lidars": lidars, "crop": crop, "imu": imu}
+    gnss = noisy.gnss.model_copy(update={"rate_hz": 5.0})
+    velocity = noisy.velocity.model_copy(update={"rate_hz": 5.0})
+    changes: dict[str, object] = {"drive": course, "lidars": lidars, "crop": crop}
+    changes |= {"imu": imu, "gnss": gnss, "velocity": velocity}
     return noisy.model_copy(update=changes)
 
 

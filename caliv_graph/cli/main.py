@@ -140,7 +140,8 @@ def run(arguments: Sequence[str]) -> int:
             # Python warnings are for developers; a user cannot act upon them.
             warnings.simplefilter("ignore")
         try:
-            code = built().main(list(arguments), prog_name=_PROGRAM, standalone_mode=False)
+            with streams.guarded_stdout():
+                code = built().main(list(arguments), prog_name=_PROGRAM, standalone_mode=False)
         except BaseException as e:
             code = INTERRUPTED if interrupts.came else _explain(e)
         if code == INTERRUPTED:

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from caliv_graph.common.progress import BarProgress, PlainProgress, SilentProgress
 from caliv_graph.errors import OutputError
@@ -51,12 +51,48 @@ def say(text: str) -> None:
     Raises:
         OutputError: stdout cannot be written: a closed pipe, a full disk.
     """
-    try:
+    with _told(sys.stdout):
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
+
+
+@contextmanager
+def guarded_stdout() -> Iterator[None]:
+    """Inside, what libraries print fails as `say` does: typer's help and rich's bars."""
+    before = sys.stdout
+    sys.stdout = cast(TextIO, _Guarded(before))
+    try:
+        yield
+    finally:
+        sys.stdout = before
+
+
+class _Guarded:
+    """A stream whose errors are told; all else is the stream's."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with _told(self._stream):
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with _told(self._stream):
+            self._stream.flush()
+
+
+@contextmanager
+def _told(stream: TextIO) -> Iterator[None]:
+    """An error of the stream's inside is an `OutputError`."""
+    try:
+        yield
     except OSError as e:
         # Otherwise Python would try to write the rest of the buffer at exit and fail again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         raise OutputError(f"standard output: cannot be written: {e.strerror}") from None
 
 

@@ -275,10 +275,12 @@ def test_a_closed_pipe_is_one_line(config: Path) -> None:
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-def test_a_full_disk_behind_stdout_is_one_line() -> None:
+@pytest.mark.parametrize("option", ["--version", "--help"])
+def test_a_full_disk_behind_stdout_is_one_line(option: str) -> None:
+    """The help is printed by typer."""
     with open("/dev/full", "w") as full:
         result = subprocess.run(
-            [sys.executable, "-m", "caliv_graph", "--version"],
+            [sys.executable, "-m", "caliv_graph", option],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,

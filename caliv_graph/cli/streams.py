@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 _PLAIN_WIDTH = 120
 """Columns of a table in a file or a pipe, which have no width of their own."""
 
+_STDOUT = "standard output"
+
 _MOST_CHARACTERS = 1500
 """Characters of a message. A damaged file may contain names of megabytes."""
 
@@ -51,49 +53,71 @@ def say(text: str) -> None:
     Raises:
         OutputError: stdout cannot be written: a closed pipe, a full disk.
     """
-    with _told(sys.stdout):
-        sys.stdout.write(f"{text}\n")
-        sys.stdout.flush()
+    if sys.stdout is None:
+        raise OutputError(f"{_STDOUT}: cannot be written: it is closed")
+    out = sys.stdout if isinstance(sys.stdout, _Guarded) else _Guarded(sys.stdout)
+    out.write(f"{text}\n")
+    out.flush()
 
 
 @contextmanager
 def guarded_stdout() -> Iterator[None]:
-    """Inside, what libraries print fails as `say` does: typer's help and rich's bars."""
+    """Inside, what libraries write fails as `say` does: typer prints the help itself.
+
+    Raises:
+        OutputError: stdout could not be written, even if a library has caught that.
+    """
     before = sys.stdout
-    sys.stdout = cast(TextIO, _Guarded(before))
+    if before is None:
+        yield
+        return
+    guarded = _Guarded(before)
+    sys.stdout = cast(TextIO, guarded)
     try:
         yield
     finally:
         sys.stdout = before
+    guarded.check()
 
 
 class _Guarded:
-    """A stream whose errors are told; all else is the stream's."""
+    """A stream that raises an `OutputError` where it cannot be written, and then at every write.
+
+    All else is the stream's.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
+        self._failed: OutputError | None = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
+    def check(self) -> None:
+        """Raises the error of an earlier write."""
+        if self._failed is not None:
+            raise self._failed
+
     def write(self, text: str) -> int:
-        with _told(self._stream):
+        with self._checked():
             return self._stream.write(text)
 
     def flush(self) -> None:
-        with _told(self._stream):
+        with self._checked():
             self._stream.flush()
 
-
-@contextmanager
-def _told(stream: TextIO) -> Iterator[None]:
-    """An error of the stream's inside is an `OutputError`."""
-    try:
-        yield
-    except OSError as e:
-        # Otherwise Python would try to write the rest of the buffer at exit and fail again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-        raise OutputError(f"standard output: cannot be written: {e.strerror}") from None
+    @contextmanager
+    def _checked(self) -> Iterator[None]:
+        self.check()
+        try:
+            yield
+        except OSError as e:
+            # Otherwise Python would try to write the rest of the buffer at exit and fail again.
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._stream.fileno())
+            os.close(null)
+            self._failed = OutputError(f"{_STDOUT}: cannot be written: {e.strerror}")
+            raise self._failed from None
 
 
 def show(table: RenderableType) -> None:

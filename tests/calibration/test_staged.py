@@ -149,7 +149,7 @@ def test_clouds_in_a_wrong_place_are_lost_and_nothing_else_changes() -> None:
 
 @pytest.mark.parametrize(
     ("kernel", "trim_percent"),
-    [("tls", 10.0), ("trimmed", 10.0), ("trimmed", 0.0)],
+    [("tls", 10.0), ("trimmed", 10.0), ("trimmed", 5.0), ("trimmed", 0.0)],
 )
 def test_other_kernels_lose_them_too(kernel: str, trim_percent: float) -> None:
     case, solution = solved(1, SLIDES[0], kernel, trim_percent)

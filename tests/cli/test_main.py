@@ -262,8 +262,11 @@ def test_progress_is_lines_where_stdout_is_no_terminal(config: Path) -> None:
     assert "\x1b" not in result.stdout
 
 
-def test_a_closed_pipe_is_one_line(config: Path) -> None:
-    process = start("inspect", config.parent / "drive")
+@pytest.mark.parametrize("arguments", [["inspect"], ["--help"]], ids=" ".join)
+def test_a_closed_pipe_is_one_line(arguments: list[str], config: Path) -> None:
+    """The help is printed by typer."""
+    drive = [config.parent / "drive"] if "inspect" in arguments else []
+    process = start(*arguments, *drive)
     assert process.stdout is not None
     assert process.stderr is not None
     process.stdout.close()
@@ -275,12 +278,21 @@ def test_a_closed_pipe_is_one_line(config: Path) -> None:
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-@pytest.mark.parametrize("option", ["--version", "--help"])
-def test_a_full_disk_behind_stdout_is_one_line(option: str) -> None:
-    """The help is printed by typer."""
+@pytest.mark.parametrize(
+    ("arguments", "unbuffered"),
+    [(["inspect"], False), (["--help"], False), (["--help"], True)],
+    ids=["inspect", "help", "help-unbuffered"],
+)
+def test_a_full_disk_behind_stdout_is_one_line(
+    arguments: list[str], unbuffered: bool, config: Path
+) -> None:
+    """Without a buffer and without rich, typer looks by a write what kind of stream it has."""
+    drive = [config.parent / "drive"] if "inspect" in arguments else []
+    plain = {"PYTHONUNBUFFERED": "1", "TYPER_USE_RICH": "0"} if unbuffered else {}
     with open("/dev/full", "w") as full:
         result = subprocess.run(
-            [sys.executable, "-m", "caliv_graph", option],
+            [sys.executable, "-m", "caliv_graph", *arguments, *drive],
+            env={**os.environ, **plain},
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
@@ -290,6 +302,21 @@ def test_a_full_disk_behind_stdout_is_one_line(option: str) -> None:
 
     assert result.returncode == 2
     assert result.stderr == "error: standard output: cannot be written: No space left on device\n"
+
+
+def test_without_standard_output_help_says_nothing_and_results_are_an_error() -> None:
+    """As `>&-` leaves it; Python has None for it then."""
+    code = (
+        "import sys; sys.stdout = None; from caliv_graph.cli.main import run; "
+        "sys.exit(10 * run(['--help']) + run(['--version']))"
+    )
+
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+
+    assert result.returncode == 2
+    assert result.stderr == "error: standard output: cannot be written: it is closed\n"
 
 
 def test_a_message_shows_what_a_terminal_would_obey(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,8 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -264,35 +263,20 @@ def small_disk(most_bytes: int) -> Callable[[], None]:
     return limit
 
 
-@contextmanager
-def on_a_small_disk(most_bytes: int) -> Iterator[None]:
-    """The same for this process: a new one imports for a second what is there already."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    answer = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    with pytest.MonkeyPatch.context() as patch:
-        # Python 3.11 leaves a cut-off cache of bytecode behind where a file cannot grow.
-        patch.setattr(sys, "dont_write_bytecode", True)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
-            signal.signal(signal.SIGXFSZ, answer)
-
-
 @pytest.mark.parametrize("most_bytes", [0, 5000])
 def test_a_disk_that_fills_up_while_a_result_is_written(
     most_bytes: int, results: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """It has 10 kB."""
     out = tmp_path / "results" / "merged.npz"
+    arguments = ["export", results[0], "--to", "npz", "--out", out]
 
-    with on_a_small_disk(most_bytes):
-        done = command("export", results[0], "--to", "npz", "--out", out)
+    process = start(*arguments, before=small_disk(most_bytes))
+    _, err = process.communicate(timeout=60)
 
-    assert done.code == 2
-    assert done.err.startswith(f"error: {out}: cannot be written: File too large")
-    assert len(done.err.splitlines()) == 1
+    assert process.returncode == 2
+    assert err.startswith(f"error: {out}: cannot be written: File too large")
+    assert len(err.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -317,12 +301,12 @@ def test_a_disk_that_fills_up_while_a_drive_is_simulated(tmp_path: Path) -> None
     scenario.write_text(yaml.safe_dump(dict(SCENARIO)))
     out = tmp_path / "drive"
 
-    with on_a_small_disk(100_000):
-        done = command("simulate", scenario, "--out", out)
+    process = start("simulate", scenario, "--out", out, before=small_disk(100_000))
+    _, err = process.communicate(timeout=60)
 
-    assert done.code == 2, done.err
-    assert done.err.startswith(f"error: {out}: cannot be written: File too large")
-    assert len(done.err.splitlines()) == 1
+    assert process.returncode == 2, err
+    assert err.startswith(f"error: {out}: cannot be written: File too large")
+    assert len(err.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["scenario.yaml"]
 
 

@@ -96,9 +96,7 @@ def read(world: World, trajectory: GivenTrajectory, body: World | None) -> Drive
     return patches
 
 
-ROCKING = rocking(EIGHT)
-WAYS = {"rocking": ROCKING, "straight": straight(60.0)}
-"""In curves on springs, and neither: on springs bodies and ground are harder to tell apart."""
+WAYS = {"eight": EIGHT, "rocking": rocking(EIGHT), "straight": straight(60.0)}
 
 
 @cache
@@ -219,26 +217,26 @@ def test_a_deck_below_which_no_ground_is_seen_turns_with_the_vehicle(way: str) -
 
 def test_a_road_above_the_fields_beside_it_stays() -> None:
     """It turns with the vehicle as well, 1.5 m above what is 3 m and more from the path."""
-    patches = in_yard("rocking", deck=False)
-    _, at = ROCKING.poses_at(np.unique(patches.stamps_ns))
+    patches = in_yard("eight", deck=False)
+    _, at = EIGHT.poses_at(np.unique(patches.stamps_ns))
     spinners = lidars(None).values()
-    centres_map, level = _in_map(patches, ROCKING, [s.T_vehicle_lidar for s in spinners])
+    centres_map, level = _in_map(patches, EIGHT, [s.T_vehicle_lidar for s in spinners])
     field = level & (cKDTree(at[:, :2]).query(centres_map[:, :2])[0] > 3.0)
     assert 0.2 < field.sum() / level.sum() < 0.8
     lowered = np.tile(np.eye(4), (len(field), 1, 1))
     lowered[field, :3, 3] = -1.5 * patches.normal_lidar[field]
     moments = lowered @ patches.moments @ lowered.transpose(0, 2, 1)
     bank = replace(patches, moments=moments)
-    assert np.ptp(_in_map(bank, ROCKING, [s.T_vehicle_lidar for s in spinners])[0][level, 2]) > 1.4
+    assert np.ptp(_in_map(bank, EIGHT, [s.T_vehicle_lidar for s in spinners])[0][level, 2]) > 1.4
 
     for config in (CONFIG, STATED):
-        assert without_own_body(bank, ROCKING, config) == (bank, ())
+        assert without_own_body(bank, EIGHT, config) == (bank, ())
 
 
 def test_guesses_too_rough_to_tell_body_from_ground_leave_it() -> None:
     """With sigmas of 10 degrees the ground may be as high as the deck."""
-    patches = in_yard("rocking", deck=True)
-    assert without_own_body(patches, ROCKING, with_sigma(10.0)) == (patches, ())
+    patches = in_yard("eight", deck=True)
+    assert without_own_body(patches, EIGHT, with_sigma(10.0)) == (patches, ())
 
 
 def with_sigma(degrees: float) -> Config:
@@ -253,7 +251,7 @@ def with_sigma(degrees: float) -> Config:
 
 
 def test_a_second_lidar_that_sees_no_body_keeps_all() -> None:
-    patches = in_yard("rocking", deck=True)
-    left, _ = without_own_body(patches, ROCKING, CONFIG)
+    patches = in_yard("eight", deck=True)
+    left, _ = without_own_body(patches, EIGHT, CONFIG)
     count = [int((p.scan_lidar[p.scan] == 0).sum()) for p in (patches, left)]
     assert count[0] == count[1] > 1000

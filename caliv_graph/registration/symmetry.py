@@ -188,10 +188,10 @@ def _symmetry_about(
     limit = identity.contradicted + MOST_CONTRADICTED
     least = FEWEST_COMPARED * identity.compared
 
-    def worse_of_both(angle_rad: float) -> RotationResult | None:
+    def worse_of_both(angle_rad: float, enough: float = math.inf) -> RotationResult | None:
         """A rotation and its inverse, the more contradicted one; None if either is hardly seen.
 
-        If the first is contradicted by more than the limit, the inverse is not tried.
+        If the first is contradicted by more than `enough`, the inverse is not tried.
         """
         worst: RotationResult | None = None
         for signed in (angle_rad,) if angle_rad == math.pi else (angle_rad, -angle_rad):
@@ -200,7 +200,7 @@ def _symmetry_about(
                 return None
             if worst is None or result.comparison.contradicted > worst.comparison.contradicted:
                 worst = result
-            if result.comparison.contradicted > limit:
+            if result.comparison.contradicted > enough:
                 break
         return worst
 
@@ -222,7 +222,7 @@ def _symmetry_about(
         # A symmetry of order 4 is one of order 2: where 180 degrees are refuted, so are 90.
         if any(order % part == 0 for part in refuted):
             continue
-        result = worse_of_both(2.0 * math.pi / order)
+        result = worse_of_both(2.0 * math.pi / order, limit)
         if result is not None and result.comparison.contradicted > limit:
             refuted.add(order)
         elif result is not None:

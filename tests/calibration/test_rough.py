@@ -1,4 +1,4 @@
-"""Which clouds the rough solve works with."""
+"""Which clouds the rough solve works with, and which symmetries of a target are told."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.rough import roughly_used
+from caliv_graph.calibration.rough import roughly_used, symmetries_of_targets
+from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.products import Side, TargetCloud, TargetObservation
 from tests.calibration.problems import make_case
+from tests.registration.scenes import config_of
+from tests.registration.test_symmetry import ALL_AROUND, seen
 
 WHOLE: frozenset[Side] = frozenset()
 CUT: frozenset[Side] = frozenset({"top"})
@@ -60,3 +63,26 @@ def test_whole_clouds_are_used_as_they_are() -> None:
     fewer, (used,) = roughly_used(problem, [seen], fewest=4)
     assert fewer is problem
     assert used == seen
+
+
+@pytest.mark.parametrize(
+    ("sigma_deg", "told"),
+    [(3.0, ()), (14.9, ()), (15.1, ("after a turn by 90 degrees",))],
+)
+def test_a_cube_is_told_where_three_sigmas_of_a_guess_reach_half_of_its_turn(
+    sigma_deg: float, told: tuple[str, ...]
+) -> None:
+    """Of one LiDAR's guess: 45 degrees."""
+    config = config_of()
+    first, *others = config.lidars
+    rough = PoseSigmaConfig(rpy_deg=(1.0, 1.0, sigma_deg))
+    lidars = {name: config.lidars[name] for name in others}
+    lidars[first] = config.lidars[first].model_copy(update={"sigma": rough})
+
+    turns, warnings = symmetries_of_targets(
+        [seen("cube", ALL_AROUND)], config.model_copy(update={"lidars": lidars})
+    )
+
+    assert turns == (None,)
+    assert len(warnings) == len(told)
+    assert all(part in warning for part, warning in zip(told, warnings, strict=True))

@@ -116,11 +116,10 @@ def concentrations(history: LidarHistory, corrections: Array) -> IntArray:
     pairs are quadratic in them: one product of matrices gives those of many corrections.
     """
     usable = history.whole & (history.extent_m < WIDE_M)
+    if usable.sum() > FEW:
+        each = (Alignment(yaw, np.array(shift_m)) for yaw, *shift_m in corrections.tolist())
+        return np.array([concentration(history, one) for one in each], dtype=np.int64)
     terms = history.base_terms(usable)
-    if len(terms) > FEW:
-        one_by_one = [concentration(history, Alignment(yaw, np.array(shift_m)))
-                      for yaw, *shift_m in corrections.tolist()]  # fmt: skip
-        return np.array(one_by_one, dtype=np.int64)
     yaw, x, y = corrections.T
     factors = np.column_stack([np.ones(len(yaw)), np.cos(yaw), np.sin(yaw), x, y])
     first, second = np.triu_indices(len(terms), 1)

@@ -122,7 +122,10 @@ class LidarHistory:
         return self.places(alignment, self._base[which], self.scan_of[which])
 
     def base_terms(self, which: BoolArray) -> Array:
-        """(n, 2, 5) x and y of `bases`, by the factors 1, cos yaw, sin yaw and shift x, y."""
+        """(n, 2, 5) x and y of `bases`, by the factors 1, cos yaw, sin yaw and shift x, y.
+
+        The sums of `places` in another order: what changes there changes here.
+        """
         R = self.R_map_vehicle[self.scan_of[which]][:, :2]
         ahead, left, up = (R[:, :, axis] for axis in range(3))
         x, y, z = (self._base[which] @ self._R_guess.T).T[:, :, None]

@@ -180,11 +180,18 @@ def _segmented(points: bytes, R: bytes) -> ScanObjects:
     return segment_scan(np.frombuffer(points).reshape(-1, 3), np.frombuffer(R).reshape(3, 3))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def clouds_are_let_go() -> Iterator[None]:
+    yield
+    _segmented.cache_clear()
+
+
 @pytest.fixture(autouse=True)
 def each_cloud_is_segmented_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Many tests search the same clouds from the same guess: half of the time of a search."""
 
     def once(points_lidar: Array, R_map_lidar: Array) -> ScanObjects:
+        assert points_lidar.dtype == R_map_lidar.dtype == np.float64
         return _segmented(points_lidar.tobytes(), R_map_lidar.tobytes())
 
     monkeypatch.setattr("caliv_graph.targets.search.find.segment_scan", once)

@@ -77,6 +77,36 @@ def test_objects_at_one_place_are_counted(monkeypatch: pytest.MonkeyPatch) -> No
     assert align.concentration(history, moved) == 2 * (1 + 3)
 
 
+@pytest.mark.parametrize("count", [0, 1, 30])
+@pytest.mark.parametrize("few", [0, align.FEW])
+def test_many_corrections_count_what_each_counts(
+    count: int, few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a vehicle that leans, a LiDAR on its side; some corrections at a time."""
+    rng = np.random.default_rng(count)
+    scans, objects = (
+        5,
+        [
+            replace(object_at(0.0), base=np.array([9.0, *rng.normal(0.0, 0.4, 2)]))
+            for _ in range(count)
+        ],
+    )
+    scan = ScanObjects(tuple(objects), np.arange(-60, 61, 3), (-0.4, 0.2), True)
+    tilts = [gtsam.Rot3.Expmap(rng.normal(0.0, 0.05, 3)).matrix() for _ in range(scans)]
+    poses = np.array(tilts), rng.normal(0.0, 0.2, (scans, 3))
+    guess = gtsam.Pose3(gtsam.Rot3.RzRyRx(1.4, 0.1, 0.2), np.array([1.0, 0.3, 2.0]))
+    history = LidarHistory("front", guess, [scan] * scans, poses, 1.0)
+    corrections = rng.uniform(-1.0, 1.0, (17, 3))
+    monkeypatch.setattr(align, "FEW", few)
+    monkeypatch.setattr(align, "AT_ONCE", 3 * 5 * count * (5 * count - 1) // 2)
+
+    found = align.concentrations(history, corrections)
+
+    each = [align.concentration(history, Alignment(c[0], c[1:])) for c in corrections]
+    assert found.tolist() == each
+    assert count < 30 or len(set(each)) > 5
+
+
 @pytest.mark.parametrize(
     ("roll_deg", "low_deg", "high_deg", "top_cut", "is_whole"),
     [

@@ -31,6 +31,7 @@ from caliv_graph.results.truth_file import read_truth
 from caliv_graph.results.vehicle import VehiclePart
 from caliv_graph.scenario.model import Scenario
 from caliv_graph.simulation import load_scenario, simulate_caliv
+from tests.scan_rates import scanned_at
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -66,17 +67,13 @@ def commands() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The demo's drive with a quarter of its clouds; its target alone calibrates it, coarsely."""
+    """The demo's drive with a quarter of its clouds, registered coarsely."""
     scenario = load_scenario(ROOT / "configs/scenarios/demo_arc.yaml")
-    lidars = {
-        name: lidar.model_copy(update={"rate_hz": 1.25}) for name, lidar in scenario.lidars.items()
-    }
     folder = tmp_path_factory.mktemp("readme") / "drive"
-    simulate_caliv(scenario.model_copy(update={"lidars": lidars}), folder, seed=1)
+    simulate_caliv(scanned_at(scenario, 1.25), folder, seed=1)
     config = folder / "config.yaml"
     document = yaml.safe_load(config.read_text(encoding="utf-8"))
     document["registration"] = {"components": 200, "max_points": 160}
-    document["structure"] = {"use": False}
     config.write_text(yaml.safe_dump(document), encoding="utf-8")
     return folder
 

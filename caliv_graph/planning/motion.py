@@ -209,10 +209,12 @@ def _propagated(
 
 
 def _transitions(turned: Array, pushed: Array, R: Array, step_s: Array) -> tuple[Array, Array]:
-    """(n, 15, 15) transition matrices over steps (n,) to second order, and over half to first.
+    """(n, 15, 15) `I + F h + (F h)^2 / 2` over steps h (n,) seconds, and `I + F h / 2`.
 
-    With F of `_propagated`: its blocks of the rotation, (n, 3, 3) of the rotation and of the
-    velocity, and the attitudes. Most blocks of F and of its square are zero.
+    F is the derivative of the rates of the errors of rotation, position, velocity, specific force
+    and angular rate. `turned` and `pushed` (n, 3, 3) are its blocks of rotation and of velocity by
+    rotation, `R` is R_map_imu; the other blocks are 0, 1 or -1. Most blocks of F and of its square
+    are zero.
     """
     n, h = len(step_s), step_s[:, None, None]
     A, B, C = turned * h, pushed * h, -R * h

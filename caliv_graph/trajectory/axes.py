@@ -162,7 +162,7 @@ class _Fit:
         squares: of the residuals and of the priors, (m/s^2)^2, independent samples.
         dof: number of independent samples.
         variance: of a sample, (m/s^2)^2.
-        normal: (8, 8) information of all coefficients, in units of the variance.
+        normal: (8, 8) information of all coefficients, the prior's too, times the variance.
     """
 
     factor: Array

@@ -22,10 +22,11 @@ from caliv_graph.trajectory.states import States
 
 NoiseModel = gtsam.noiseModel.Base
 
-UNIT = np.eye(3)
+IDENTITY = np.eye(3)
+"""Made once: there are many fixes and messages of wheels."""
 
-SKEW = np.array([skew(axis) for axis in UNIT]).transpose(1, 2, 0)
-"""`SKEW @ v` is `skew(v)`, in a third of the time: fixes and messages of wheels are many."""
+SKEW = np.array([skew(axis) for axis in IDENTITY]).transpose(1, 2, 0)
+"""`SKEW @ v` is `skew(v)`, in a third of the time."""
 
 POSE_SIZE, ROTATION_SIZE = 6, 3
 """Coordinates of the tangent of a pose, and of a rotation."""
@@ -74,14 +75,16 @@ def _position_error(
     stays in pieces when they are gone.
     """
     offset_imu, shift, delay_s = known[:3], known[3:6], known[6]
-    T = values.atPose3(key_imu).matrix()  # one call of GTSAM: each takes as long as a product
+    T = values.atPose3(
+        key_imu
+    ).matrix()  # one call of GTSAM: it takes as long as a product
     R = T[:3, :3]
     if jacobians is not None:
         J = np.empty((3, 6))
         J[:, :3] = R @ (SKEW @ -offset_imu)
         J[:, 3:] = R
         jacobians[0] = J
-        jacobians[1] = delay_s * UNIT
+        jacobians[1] = delay_s * IDENTITY
     velocity = values.atVector(key_velocity)
     return np.asarray(T[:3, 3] + delay_s * velocity + R @ offset_imu + shift)
 

@@ -47,6 +47,7 @@ from caliv_graph.structure.term import lidars_with_ground
 from caliv_graph.uncertainty.observability import UNIT
 from tests.drives_with_chair import RADIUS_M, paper_lidar
 from tests.samples import turn_about, twist_of_all
+from tests.scan_rates import scanned_at
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 
@@ -221,7 +222,7 @@ def test_a_suggestion_counts_the_walls_of_a_recorded_drive() -> None:
     chair = WorldModel(objects={"chair": ChairModel(xy_m=(0.0, 0.0))}, targets=("chair",))
     vehicle = scenario.model_copy(update={"world": chair})
 
-    alone = suggest(vehicle, {}, Assumptions(structure=False))
+    alone = suggest(vehicle, {}, Assumptions())
     beside = suggest(vehicle, {}, Assumptions(), [recorded])
 
     assert alone is not None
@@ -387,9 +388,7 @@ def test_ground_without_walls_is_told_cell_by_cell() -> None:
 
 def test_a_lidar_that_sees_ground_alone_is_not_taken_as_known() -> None:
     """It knows the ground no better than its own mounting; taken as known it halved S2V roll."""
-    scenario = load_scenario(SCENARIOS / "paper_arc.yaml")
-    few = {n: lidar.model_copy(update={"rate_hz": 2.0}) for n, lidar in scenario.lidars.items()}
-    scenario = scenario.model_copy(update={"lidars": few})
+    scenario = scanned_at(load_scenario(SCENARIOS / "paper_arc.yaml"), 2.0)
     down = scenario.lidars["rear"].model_copy(update={"vertical_fov_deg": (-60.0, -40.0)})
     front = scenario.model_copy(update={"lidars": {"front": scenario.lidars["front"]}})
     both = scenario.model_copy(update={"lidars": {**front.lidars, "rear": down}})

@@ -39,6 +39,7 @@ from scripts._paper import (
 from scripts._paper_registration import cube_components, register_clouds
 from scripts.benchmark_paper import OURS, PAPER, KeptRecording, Outcome
 from tests.samples import make_calibration, pose
+from tests.scan_rates import scanned_at
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -365,8 +366,7 @@ def test_a_reference_that_saw_nothing_is_named() -> None:
 def drive() -> tuple[KeptRecording, Config, SimulatedTruth]:
     """The demo's arc with half of its clouds: pairs are a quarter, and the errors are no larger."""
     scenario = load_scenario(ROOT / "configs/scenarios/demo_arc.yaml")
-    few = {n: lidar.model_copy(update={"rate_hz": 2.5}) for n, lidar in scenario.lidars.items()}
-    recording = simulate_drive(scenario.model_copy(update={"lidars": few}), 1)
+    recording = simulate_drive(scanned_at(scenario, 2.5), 1)
     config = parse_config(config_of(recording, has_bag=True), "demo_arc", ROOT)
     return KeptRecording(recording), config, recording.truth
 

@@ -23,6 +23,7 @@ from caliv_graph.scenario.world_models import (
 from caliv_graph.simulation import Scenario, SimulatedRecording, load_scenario, simulate_drive
 from caliv_graph.simulation.rays import RayCaster
 from caliv_graph.simulation.recording import HEAVE_PERIOD_NS
+from tests.scan_rates import scanned_every
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
 
@@ -320,15 +321,6 @@ def test_number_of_threads_changes_nothing() -> None:
         np.testing.assert_array_equal(a.points_lidar, b.points_lidar)
 
 
-def with_every(scenario: Scenario, count: int) -> Scenario:
-    """With every so many-th scan alone: of scans that nobody asks for the noise is drawn too."""
-    few = {
-        name: lidar.model_copy(update={"rate_hz": lidar.rate_hz / count})
-        for name, lidar in scenario.lidars.items()
-    }
-    return scenario.model_copy(update={"lidars": few})
-
-
 @pytest.mark.parametrize(
     ("name", "both"),
     [
@@ -343,7 +335,7 @@ def test_shipped_scenarios_show_the_target_to_every_lidar(name: str, both: dict[
     """Scans that see the target with at least 50 points; every tenth of a long drive."""
     scenario = load_scenario(SCENARIOS / f"{name}.yaml")
     every = 10 if isinstance(scenario.drive, FigureEightDrive) else 4
-    recording = simulate_drive(with_every(scenario, every), 0)
+    recording = simulate_drive(scanned_every(scenario, every), 0)
     is_target = np.isin(recording.world.names, recording.world.targets)
     for lidar, least in both.items():
         counts = [
@@ -357,7 +349,7 @@ def test_shipped_scenarios_show_the_target_to_every_lidar(name: str, both: dict[
 
 
 def test_ramp_is_driven_over_while_the_target_is_seen() -> None:
-    recording = simulate_drive(with_every(load_scenario(SCENARIOS / "ramp.yaml"), 10), 0)
+    recording = simulate_drive(scanned_every(load_scenario(SCENARIOS / "ramp.yaml"), 10), 0)
     chair = recording.world.names.index("chair")
     for name in recording.lidars:
         stamps = [

@@ -24,6 +24,7 @@ from caliv_graph.targets.ground.planes import (
     near_points,
 )
 from tests.samples import pose
+from tests.scan_rates import scanned_every
 from tests.targets.ground.scans import (
     HEIGHT_M,
     RING,
@@ -341,11 +342,7 @@ def simulated(
     Scans that nobody asks for cost too: their noise is drawn.
     """
     scenario = load_scenario(ROOT / "configs" / "scenarios" / f"{name}.yaml")
-    few = {
-        name: lidar.model_copy(update={"rate_hz": lidar.rate_hz / every})
-        for name, lidar in scenario.lidars.items()
-    }
-    recording = simulate_drive(scenario.model_copy(update={"lidars": few}), seed)
+    recording = simulate_drive(scanned_every(scenario, every), seed)
     truth = recording.truth
     out: dict[str, list[tuple[GroundPlane | None, Array, float]]] = {}
     for lidar in recording.lidars:

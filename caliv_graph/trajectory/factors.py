@@ -75,9 +75,7 @@ def _position_error(
     stays in pieces when they are gone.
     """
     offset_imu, shift, delay_s = known[:3], known[3:6], known[6]
-    T = values.atPose3(
-        key_imu
-    ).matrix()  # one call of GTSAM: it takes as long as a product
+    T = values.atPose3(key_imu).matrix()  # one call of GTSAM: it takes as long as a product
     R = T[:3, :3]
     if jacobians is not None:
         J = np.empty((3, 6))

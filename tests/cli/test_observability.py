@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,21 +36,35 @@ def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@dataclass(frozen=True)
+class Kept:
+    """Stages before the graph, and what they were asked for."""
+
+    names: list[str]
+    config: Config
+    prepared: Prepared
+
+
 @pytest.fixture(scope="module")
-def kept() -> list[Prepared]:
-    """The stages before the graph, of the arc."""
+def kept() -> list[Kept]:
+    """Those of the arc."""
     return []
 
 
 @pytest.fixture
-def prepared_once(kept: list[Prepared], monkeypatch: pytest.MonkeyPatch) -> None:
+def prepared_once(kept: list[Kept], monkeypatch: pytest.MonkeyPatch) -> None:
     """The drive is the same in several commands, which differ in what their configs require."""
 
     def once(recordings: Any, config: Config, motions: Any, progress: Any) -> Prepared:
+        names = [recording.name for recording in recordings]
         if not kept:
-            kept.append(prepare(recordings, config, motions, progress))
-        required = kept[0].config.model_copy(update={"require": config.require})
-        return replace(kept[0], config=required)
+            kept.append(Kept(names, config, prepare(recordings, config, motions, progress)))
+        (of,) = kept
+        assert names == of.names
+        asked = {"data": config.data, "require": config.require}
+        assert of.config.model_copy(update=asked) == config
+        required = of.prepared.config.model_copy(update={"require": config.require})
+        return replace(of.prepared, config=required)
 
     monkeypatch.setattr("caliv_graph.workflows.survey.prepare", once)
 

@@ -36,10 +36,10 @@ from tests.trajectory.motions import (
 
 COURSE = Course(eight_drive(12.0), rough=1.0)
 SENSORS = replace(mounted_askew(), imu_hz=50.0, twist_hz=20.0, twist_delay_s=0.017)
-LONGER = Course(eight_drive(18.0), rough=1.0)
+MEDIUM = Course(eight_drive(18.0), rough=1.0)
 """Of 12 s the course tells the rotation of an IMU to 4 degrees only."""
 
-LONGER_WANTED = stamps(18.0, 2.0, 0.0512)
+MEDIUM_WANTED = stamps(18.0, 2.0, 0.0512)
 
 LONG = Course(eight_drive(24.0), rough=1.0)
 """Where fixes are late, accelerations of 18 s leave open by how much."""
@@ -138,7 +138,7 @@ def test_what_was_measured_roughly_is_in_the_covariance_of_every_pose() -> None:
 def test_the_scale_and_the_axes_of_a_gyroscope_are_estimated() -> None:
     """4 mrad per radian: in a figure-eight the heading is 20 mrad off, and comes back."""
     sensors = replace(SENSORS, noise=0.1)
-    motion = record(LONGER, sensors, 3)
+    motion = record(MEDIUM, sensors, 3)
     imu = motion.imu
     assert imu is not None
     up = sensors.T_vehicle_imu.rotation().matrix()[2]
@@ -147,7 +147,7 @@ def test_the_scale_and_the_axes_of_a_gyroscope_are_estimated() -> None:
     motion = replace(motion, imu=replace(imu, angular_velocity=gyro))
     usual = config_for(sensors, imu={"gyroscope_scale_sigma": 2e-3})
 
-    smoothed = smooth_trajectory(motion, usual, LONGER_WANTED)
+    smoothed = smooth_trajectory(motion, usual, MEDIUM_WANTED)
 
     (found,) = (p for p in smoothed.parameters if p.parameter.name == "imu.gyroscope")
     sigma = smoothed.sigmas_of("imu.gyroscope")
@@ -155,15 +155,15 @@ def test_the_scale_and_the_axes_of_a_gyroscope_are_estimated() -> None:
     assert found.offset is not None
     assert sigma.max() < 4e-4
     assert np.abs((found.offset - response) / sigma).max() < 3.5
-    assert nees(motion, smoothed, LONGER) < 12.0
+    assert nees(motion, smoothed, MEDIUM) < 12.0
     # A tenth of the usual noise. Held, the scale would be taken for eight times as much.
-    exact = smooth_trajectory(motion, config_for(sensors), LONGER_WANTED)
+    exact = smooth_trajectory(motion, config_for(sensors), MEDIUM_WANTED)
     assert smoothed.data.scales["gyroscope"] < 0.15
     assert exact.data.scales["gyroscope"] > 0.5
     # Twenty of its sigmas are said, two are not.
     assert not any("gyroscope" in line for line in smoothed.warnings)
     narrow = config_for(sensors, imu={"gyroscope_scale_sigma": 2e-4})
-    again = smooth_trajectory(motion, narrow, LONGER_WANTED, (), smoothed.data.scales, smoothed)
+    again = smooth_trajectory(motion, narrow, MEDIUM_WANTED)
     said = [w for w in again.warnings if "gyroscope" in w]
     assert len(said) == 1
     assert "imu.gyroscope_scale_sigma is 0.02 percent" in said[0]
@@ -203,9 +203,9 @@ def test_an_imu_on_its_side_is_found(rpy_deg: tuple[float, float, float]) -> Non
     }
 
     smoothed = smooth_trajectory(
-        record(LONGER, sensors, 4),
+        record(MEDIUM, sensors, 4),
         config_for(sensors, imu=unknown),
-        LONGER_WANTED,
+        MEDIUM_WANTED,
     )
 
     off = gtsam.Rot3.Logmap(smoothed.data.T_vehicle_imu.rotation().compose(R.inverse()))
@@ -221,7 +221,7 @@ def test_the_guess_of_an_imu_without_orientation_is_within_its_sigma(yaw_deg: fl
     system singular, and the guess was that of the first seconds, up to 30 degrees off."""
     R = gtsam.Rot3.RzRyRx(0.02, -0.03, math.radians(yaw_deg))
     sensors = replace(SENSORS, T_vehicle_imu=gtsam.Pose3(R, np.array([1.2, -0.4, 0.6])))
-    motion = record(LONGER, sensors, 4)
+    motion = record(MEDIUM, sensors, 4)
     assert motion.imu is not None
     motion = replace(motion, imu=replace(motion.imu, orientation_xyzw=None), twist=None)
     unknown: dict[str, object] = {
@@ -229,7 +229,7 @@ def test_the_guess_of_an_imu_without_orientation_is_within_its_sigma(yaw_deg: fl
         "rotation_sigma_deg": None,
     }
     data, _ = check_input(motion, config_for(sensors, imu=unknown))
-    nodes = place_nodes(data.inertial, LONGER_WANTED)
+    nodes = place_nodes(data.inertial, MEDIUM_WANTED)
 
     guessed = with_guessed_rotation(data, nodes, partial(_solved_roughly, nodes))
 

@@ -182,7 +182,8 @@ def main() -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     if code == INTERRUPTED:
         # After an interrupt in native code, Python would end by the signal.
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:  # closed
+                stream.flush()
         os._exit(code)
     sys.exit(code)

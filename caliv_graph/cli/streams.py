@@ -147,14 +147,19 @@ def progress_on_stdout(as_json: bool) -> Iterator[SilentProgress]:
     """Shows progress: bars on a terminal, lines elsewhere, nothing with `--json`."""
     if as_json:
         yield SilentProgress()
-    elif sys.stdout.isatty() and not (console := _console()).is_dumb_terminal:
+    elif _on_terminal() and not (console := _console()).is_dumb_terminal:
         with BarProgress(console) as progress:
             yield progress
     else:
         yield PlainProgress(say)
 
 
+def _on_terminal() -> bool:
+    """Whether stdout is a terminal; None stands for one that is closed (`>&-`)."""
+    return sys.stdout is not None and sys.stdout.isatty()
+
+
 def _console() -> Console:
     from rich.console import Console  # takes 0.1 s, which --help saves
 
-    return Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+    return Console(width=None if _on_terminal() else _PLAIN_WIDTH)

@@ -14,6 +14,7 @@ import pytest
 
 from caliv_graph import __version__
 from caliv_graph.__main__ import main
+from caliv_graph.cli import main as command_line
 from caliv_graph.cli import streams
 from tests.cli.commands import ROOT, called, run, start, write_config, write_drive
 
@@ -304,19 +305,18 @@ def test_a_full_disk_behind_stdout_is_one_line(
     assert result.stderr == "error: standard output: cannot be written: No space left on device\n"
 
 
-def test_without_standard_output_help_says_nothing_and_results_are_an_error() -> None:
+def test_without_standard_output_help_says_nothing_and_results_are_an_error(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As `>&-` leaves it; Python has None for it then."""
-    code = (
-        "import sys; sys.stdout = None; from caliv_graph.cli.main import run; "
-        "sys.exit(10 * run(['--help']) + run(['--version']))"
-    )
+    monkeypatch.setattr(sys, "stdout", None)
 
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
-    )
-
-    assert result.returncode == 2
-    assert result.stderr == "error: standard output: cannot be written: it is closed\n"
+    assert command_line.run(["--help"]) == 0
+    assert capsys.readouterr().err == ""
+    for arguments in (["--version"], ["inspect", str(config.parent / "drive")]):
+        assert command_line.run(arguments) == 2
+        told = capsys.readouterr().err
+        assert told == "error: standard output: cannot be written: it is closed\n"
 
 
 def test_a_message_shows_what_a_terminal_would_obey(capsys: pytest.CaptureFixture[str]) -> None:

@@ -196,25 +196,23 @@ def size_weights(
         priors: of the sizes.
     """
     information = 0.5 * (information + information.T)
-    if len(priors) == 1:
-        return _weights_of_one(information, pull, priors[0])
     # The kind with the most errors is integrated out on its own axes, at each of its sizes. What
     # is left is small.
     most = int(np.argmax(np.bincount(kinds, minlength=len(priors))))
     rest = [k for k in range(len(priors)) if k != most]
     grids = np.meshgrid(*(priors[k].sigmas for k in rest), indexing="ij")
     few, many = np.flatnonzero(kinds != most), np.flatnonzero(kinds == most)
-    sizes = np.stack(grids, axis=-1)[..., np.searchsorted(rest, kinds[few])]
+    sizes = np.stack(grids, axis=-1)[..., np.searchsorted(rest, kinds[few])] if rest else np.ones(0)
     values, axes = np.linalg.eigh(information[np.ix_(many, many)])
     values = np.maximum(values, 0.0)
     common, pulled = axes.T @ information[np.ix_(many, few)], axes.T @ pull[many]
+    variances = priors[most].sigmas[:, None] ** 2
+    known = 1.0 + variances * values
+    alone = 0.5 * (np.log(known) - variances / known * pulled**2).sum(axis=1)
     costs = []
-    for sigma in priors[most].sigmas.tolist():
-        known = 1.0 + sigma**2 * values
-        lost = sigma**2 / known
+    for own, lost in zip(alone, variances / known, strict=True):
         left = information[np.ix_(few, few)] - common.T @ (lost[:, None] * common)
-        alone = 0.5 * (np.log(known) - lost * pulled**2).sum()
-        costs.append(alone + _costs_of(left, pull[few] - common.T @ (lost * pulled), sizes))
+        costs.append(own + _costs_of(left, pull[few] - common.T @ (lost * pulled), sizes))
     cost = np.moveaxis(np.array(costs), 0, most)
     for k, prior in enumerate(priors):
         cost += prior.cost.reshape([-1 if axis == k else 1 for axis in range(len(priors))])
@@ -222,19 +220,10 @@ def size_weights(
     return np.asarray(weights / weights.sum())
 
 
-def _weights_of_one(information: Array, pull: Array, prior: SizePrior) -> Array:
-    """`size_weights` of errors of one kind, at all of its sizes at once."""
-    values, axes = np.linalg.eigh(information)
-    variances = prior.sigmas[:, None] ** 2
-    known = 1.0 + variances * np.maximum(values, 0.0)
-    costs = 0.5 * (np.log(known) - variances / known * (axes.T @ pull) ** 2).sum(axis=1)
-    costs += prior.cost
-    weights = np.exp(costs.min() - costs)
-    return np.asarray(weights / weights.sum())
-
-
 def _costs_of(information: Array, pull: Array, sigmas: Array) -> Array:
     """(...) minus the logarithms of the restricted likelihood, of errors with sigmas (..., B)."""
+    if not len(pull):
+        return np.zeros(sigmas.shape[:-1])
     own = np.eye(len(pull)) + sigmas[..., :, None] * information * sigmas[..., None, :]
     L, pulls = np.linalg.cholesky(own), sigmas * pull
     moved = np.linalg.solve(own, pulls[..., None])[..., 0]

@@ -202,9 +202,9 @@ def _propagated(
     for k in range(SUBSTEPS):
         own = slice(k * (n - 1), (k + 1) * (n - 1))
         whole, half = _transitions(turned[own], pushed[own], R[own], step)
-        noise = (half * (density * step[:, None])[:, None]) @ _transposed(half)
+        noise = (half * (density * step[:, None])[:, None]) @ np.swapaxes(half, 1, 2)
         carried = whole @ carried
-        cov = whole @ cov @ _transposed(whole) + noise
+        cov = whole @ cov @ np.swapaxes(whole, 1, 2) + noise
     return carried, cov
 
 
@@ -234,10 +234,6 @@ def _transitions(turned: Array, pushed: Array, R: Array, step_s: Array) -> tuple
     whole[:, 6:9, 0:3] += 0.5 * B @ A
     whole[:, 6:9, 12:15] = -0.5 * h * B
     return whole, half
-
-
-def _transposed(matrices: Array) -> Array:
-    return np.swapaxes(matrices, 1, 2)
 
 
 def _add_aiding(diagonal: Array, drive: Route, nodes: IntArray, scenario: Scenario) -> None:

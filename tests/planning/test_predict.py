@@ -40,6 +40,7 @@ from caliv_graph.scenario.world_models import (
 )
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M
 from tests.drives_with_chair import paper_lidar, paper_scenario
+from tests.scan_rates import scanned_at
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 
@@ -140,13 +141,8 @@ FIGURE_EIGHT = FigureEightDrive()
 STANDSTILL = StandstillDrive(duration_s=5.0)
 
 
-def drive_past(
-    drive: DriveModel,
-    chair_xy_m: tuple[float, float],
-    *ramps: RampModel,
-    rate_hz: float = 10.0,
-) -> Scenario:
-    scenario = paper_scenario(drive, rate_hz=rate_hz, chair_xy_m=chair_xy_m)
+def drive_past(drive: DriveModel, chair_xy_m: tuple[float, float], *ramps: RampModel) -> Scenario:
+    scenario = paper_scenario(drive, rate_hz=10.0, chair_xy_m=chair_xy_m)
     if drive.kind == "standstill":
         lidars = {"front": paper_lidar(2.0, 0.0), "rear": paper_lidar(1.0, 70.0, y_m=0.8)}
         scenario = scenario.model_copy(update={"lidars": lidars})
@@ -377,7 +373,7 @@ def test_turning_and_shifting_the_world_changes_nothing(ground: Ground) -> None:
 
 
 def test_the_order_of_the_lidars_changes_nothing() -> None:
-    scenario = drive_past(ARC, (15.16, -9.16), rate_hz=2.0)
+    scenario = scanned_at(DRIVES["arc"][0], 2.0)
     turned = scenario.model_copy(
         update={"lidars": {n: scenario.lidars[n] for n in reversed(scenario.lidars)}}
     )
@@ -537,11 +533,11 @@ def test_opposite_sides_of_the_target_are_warned_of() -> None:
 
 def test_a_target_out_of_reach_is_an_error_with_the_next_step() -> None:
     with pytest.raises(TargetError, match=r"no LiDAR sees a target: .* in 0 of .* nearer"):
-        predict(drive_past(ARC, (150.0, 0.0), rate_hz=2.0))
+        predict(scanned_at(drive_past(ARC, (150.0, 0.0)), 2.0))
 
 
 def test_no_target_at_all() -> None:
-    scenario = drive_past(ARC, (15.0, -9.0), rate_hz=2.0)
+    scenario = scanned_at(DRIVES["arc"][0], 2.0)
     world = WorldModel(objects={"chair": ChairModel(xy_m=(15.0, -9.0))})
     with pytest.raises(ConfigError, match=r"world\.targets names no target"):
         predict(scenario.model_copy(update={"world": world}))

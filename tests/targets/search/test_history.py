@@ -84,13 +84,9 @@ def test_many_corrections_count_what_each_counts(
 ) -> None:
     """On a vehicle that leans, a LiDAR on its side; some corrections at a time."""
     rng = np.random.default_rng(count)
-    scans, objects = (
-        5,
-        [
-            replace(object_at(0.0), base=np.array([9.0, *rng.normal(0.0, 0.4, 2)]))
-            for _ in range(count)
-        ],
-    )
+    scans = 5
+    bases = [np.array([9.0, *rng.normal(0.0, 0.4, 2)]) for _ in range(count)]
+    objects = [replace(object_at(0.0), base=base) for base in bases]
     scan = ScanObjects(tuple(objects), np.arange(-60, 61, 3), (-0.4, 0.2), True)
     tilts = [gtsam.Rot3.Expmap(rng.normal(0.0, 0.05, 3)).matrix() for _ in range(scans)]
     poses = np.array(tilts), rng.normal(0.0, 0.2, (scans, 3))

@@ -401,9 +401,7 @@ def test_a_quick_look_is_nearly_as_good() -> None:
 
 
 def test_a_quick_look_at_two_clouds_uses_both() -> None:
-    first, *_ = DRIVES["arc"]
-    slow = {n: m.model_copy(update={"rate_hz": 0.2}) for n, m in first.lidars.items()}
-    scenario = first.model_copy(update={"lidars": slow})
+    scenario = scanned_at(DRIVES["arc"][0], 0.2)
     assumptions = Assumptions(ranges=EXACT, extraction=ExtractionConfig(min_scans=2))
     full = predict(scenario, assumptions=assumptions)
     assert [len(s.used) for s in full.sightings[0] if len(s.used)] == [2]

@@ -24,6 +24,7 @@ from caliv_graph.planning.suggest import (
 )
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.scenario.model import Scenario, dump_scenario, load_scenario, parse_scenario
+from tests.scan_rates import scanned_at
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "configs" / "scenarios"
 
@@ -34,9 +35,7 @@ it, a prediction takes ten times as long."""
 
 def scenario(name: str = "paper_arc", rate_hz: float = 2.0) -> Scenario:
     """Slowly: what slow errors and the target leave is the same, a prediction is much faster."""
-    of = load_scenario(SCENARIOS / f"{name}.yaml")
-    slow = {n: lidar.model_copy(update={"rate_hz": rate_hz}) for n, lidar in of.lidars.items()}
-    return of.model_copy(update={"lidars": slow})
+    return scanned_at(load_scenario(SCENARIOS / f"{name}.yaml"), rate_hz)
 
 
 def area(found: Scenario) -> float:

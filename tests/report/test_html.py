@@ -43,6 +43,7 @@ from caliv_graph.scenario.model import load_scenario
 from caliv_graph.simulation.simulate import write_drive
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.drives_with_chair import QUICK, paper_scenario, simulated, without_structure
+from tests.scan_rates import scanned_at
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -95,11 +96,10 @@ class Ran:
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """An arc from raw sensors, and a LiDAR with a bad name that never sees the target."""
     folder = tmp_path_factory.mktemp("bag") / EVIL_FOLDER
-    scenario = load_scenario(ROOT / "configs/scenarios/demo_arc.yaml")
-    slow = {n: m.model_copy(update={"rate_hz": 1.25}) for n, m in scenario.lidars.items()}
+    scenario = scanned_at(load_scenario(ROOT / "configs/scenarios/demo_arc.yaml"), 1.25)
     assert scenario.crop is not None
     crop = scenario.crop.model_copy(update={"elsewhere_stride": 12})
-    few = scenario.model_copy(update={"lidars": slow, "crop": crop})
+    few = scenario.model_copy(update={"crop": crop})
     write_drive(few, folder, 1, threads=1)
     config = without_structure(load_config(folder / "config.yaml"))
     blind = config.lidars["front"].model_copy(update={"min_range": 400.0, "max_range": 450.0})

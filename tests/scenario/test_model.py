@@ -11,6 +11,7 @@ from caliv_graph.scenario.drive_models import ArcDrive, FigureEightDrive
 from caliv_graph.scenario.model import Scenario, dump_scenario, load_scenario, parse_scenario
 from caliv_graph.scenario.world import make_world
 from tests.cli.commands import write_config
+from tests.scan_rates import scanned_at
 
 SCENARIOS = Path(__file__).parents[2] / "configs" / "scenarios"
 
@@ -63,10 +64,7 @@ def test_paper_arc_is_the_paper_s_set_up() -> None:
 def test_demo_arc_differs_in_nothing_but_size() -> None:
     paper = load_scenario(SCENARIOS / "paper_arc.yaml")
     demo = load_scenario(SCENARIOS / "demo_arc.yaml")
-    lidars = {
-        name: lidar.model_copy(update={"rate_hz": 10.0}) for name, lidar in demo.lidars.items()
-    }
-    full = demo.model_copy(update={"name": paper.name, "crop": None, "lidars": lidars})
+    full = scanned_at(demo, 10.0).model_copy(update={"name": paper.name, "crop": None})
     assert full == paper
 
 

@@ -21,6 +21,7 @@ from scripts import benchmark_constants as benchmark
 from scripts._constants_table import CONFIG, CONSTANTS
 from scripts._patched import PACKAGE, Place, UnreachableError, current, patched
 from tests.kept import KeptDrive
+from tests.scan_rates import scanned_at
 
 SMALL: Mapping[str, Mapping[str, Any]] = {
     "registration": {"components": 60, "max_points": 120, "max_iterations": 20},
@@ -131,9 +132,8 @@ def test_a_failure_is_counted_and_compared_with_nothing() -> None:
 def test_a_constant_changes_a_drive(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     scenario = load_scenario(drives.SCENARIOS / "demo_arc.yaml")
     # Few clouds are enough for a change: `SMALL` takes 12 of each LiDAR.
-    lidars = {n: li.model_copy(update={"rate_hz": 1.25}) for n, li in scenario.lidars.items()}
     # Of seeds 1 and 6 the noise of the poses, fitted to so few clouds, leaves none with a weight.
-    recording = KeptDrive(scenario.model_copy(update={"lidars": lidars}), 3)
+    recording = KeptDrive(scanned_at(scenario, 1.25), 3)
     monkeypatch.setattr(drives, "_recording", lambda *_: recording)
 
     own = drives.performed("given", 3, tmp_path, SMALL, early=False)

@@ -19,6 +19,7 @@ from caliv_graph.scenario.shapes import object_mesh
 from scripts import _targets as targets
 from scripts import benchmark_targets as benchmark
 from scripts._targets import DRIVES, LIDARS, OBJECTS, Result, Task
+from tests.scan_rates import scanned_at
 
 BIN = Task("bin", "spin32", "figure_eight", 1)
 
@@ -28,11 +29,10 @@ def short_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drives of 5 seconds with a cloud a second."""
 
     def short(name: str) -> Any:
-        whole = load_scenario(targets.SCENARIOS / f"{name}.yaml")
-        lidars = {n: m.model_copy(update={"rate_hz": 1.0}) for n, m in whole.lidars.items()}
+        whole = scanned_at(load_scenario(targets.SCENARIOS / f"{name}.yaml"), 1.0)
         still = SuspensionModel(height_sigma_m=0.0, heave_sigma_m=0.0)
         drive = ArcDrive(duration_s=5.0)
-        return whole.model_copy(update={"drive": drive, "lidars": lidars, "suspension": still})
+        return whole.model_copy(update={"drive": drive, "suspension": still})
 
     monkeypatch.setattr(targets, "_drive", short)
 

@@ -20,6 +20,9 @@ GATE_M = 0.5
 """Distance from its place within which an object is associated with a track: half the change of its
 visible side, and the effect of roll and pitch of the guess on objects lower than the LiDAR."""
 
+GATES_M = (0.5 * GATE_M, GATE_M)
+"""Distances within which two objects count as one, both in a `concentration`."""
+
 ALIGN_STEP_M = 0.2
 ALIGN_RANGE_M = 20.0
 """The yaw of a LiDAR is searched in steps that displace objects at `ALIGN_RANGE_M` by
@@ -64,13 +67,10 @@ def align(history: LidarHistory, config: Config) -> Alignment:
     sigma_yaw = lidar.sigma.rpy_rad()[2]
     limit = GUESS_SIGMAS * sigma_yaw
     steps = math.ceil(limit * ALIGN_RANGE_M / ALIGN_STEP_M)
-    best, best_score = Alignment(), -math.inf
-    for yaw in limit * np.arange(-steps, steps + 1) / max(steps, 1):
-        pairs = concentration(history, Alignment(float(yaw)))
-        # Among equal scores the guess decides.
-        score = float(pairs) * (1.0 - 0.02 * (yaw / sigma_yaw) ** 2)
-        if score > best_score:
-            best, best_score = Alignment(float(yaw)), score
+    yaws = limit * np.arange(-steps, steps + 1) / max(steps, 1)
+    # Among equal scores the guess decides.
+    scores = _concentrations_of_yaws(history, yaws) * (1.0 - 0.02 * (yaws / sigma_yaw) ** 2)
+    best = Alignment(float(yaws[np.argmax(scores)]))
     for _ in range(3):
         best = _refined(history, best, config)
     return best
@@ -82,8 +82,7 @@ def align_anywhere(history: LidarHistory, config: Config) -> Alignment:
         return Alignment()
 
     steps = np.arange(-math.pi, math.pi, ALIGN_STEP_M / ALIGN_RANGE_M)
-    yaws = np.column_stack([steps, np.zeros((len(steps), 2))])
-    about = float(steps[np.argmax(concentrations(history, yaws))])
+    about = float(steps[np.argmax(_concentrations_of_yaws(history, steps))])
     near = np.arange(-FAR_SHIFT_M, FAR_SHIFT_M + 0.5 * FAR_STEP_M, FAR_STEP_M)
     turns = about + FAR_YAW_RAD * np.linspace(-1.0, 1.0, FAR_YAWS)
     every = np.stack(np.meshgrid(turns, near, near, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -101,12 +100,11 @@ def concentration(history: LidarHistory, alignment: Alignment) -> int:
     """
     usable = history.whole & (history.extent_m < WIDE_M)
     places = history.bases(alignment, usable)[:, :2]
-    gates_m = np.array([0.5, 1.0]) * GATE_M
     if len(places) <= FEW:
         apart2 = pdist(places, "sqeuclidean") if len(places) > 1 else np.zeros(0)
-        return 2 * sum(int(np.count_nonzero(apart2 <= gate_m**2)) for gate_m in gates_m.tolist())
+        return 2 * sum(int(np.count_nonzero(apart2 <= gate_m**2)) for gate_m in GATES_M)
     tree = cKDTree(places)
-    return int(tree.count_neighbors(tree, gates_m).sum() - 2 * len(places))
+    return int(tree.count_neighbors(tree, np.array(GATES_M)).sum() - len(GATES_M) * len(places))
 
 
 def concentrations(history: LidarHistory, corrections: Array) -> IntArray:
@@ -132,9 +130,14 @@ def concentrations(history: LidarHistory, corrections: Array) -> IntArray:
     step = max(1, AT_ONCE // max(len(first), 1))
     for begin in range(0, len(factors), step):
         apart2 = of_factors[begin : begin + step] @ products.T
-        for gate_m in (0.5 * GATE_M, GATE_M):
+        for gate_m in GATES_M:
             count[begin : begin + step] += np.count_nonzero(apart2 <= gate_m**2, axis=1)
     return 2 * count
+
+
+def _concentrations_of_yaws(history: LidarHistory, yaws_rad: Array) -> IntArray:
+    """(k,) the same under corrections of the yaw alone (k,)."""
+    return concentrations(history, np.column_stack([yaws_rad, np.zeros((len(yaws_rad), 2))]))
 
 
 def _refined(

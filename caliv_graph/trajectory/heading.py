@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from caliv_graph.products import Array, IntArray, MotionData
+from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.wheels import is_planar
 
@@ -107,10 +108,14 @@ def heading_disagreement(
         return None
     measured = _measured_at(motion, at[fast], begin)
     map_turn, source = _turn_against_fixes(smoothed), _source(smoothed)
+    sigma = _heading_sigma(smoothed)
+    if abs(map_turn) > MAP_TURN_RAD and source == "imu":
+        # Where fixes were dropped for it, the smoothed path may go anywhere.
+        map_turn, sigma = _turn_of_orientations(smoothed, motion)
     if abs(map_turn) > MAP_TURN_RAD:
         return HeadingDisagreement(
             yaw_rad=map_turn,
-            sigma_rad=math.hypot(_heading_sigma(smoothed), FLOOR_RAD),
+            sigma_rad=math.hypot(sigma, FLOOR_RAD),
             axle_m=math.nan,
             duration_s=duration_s,
             measured=measured is not None,
@@ -169,25 +174,70 @@ def _turn_against_fixes(smoothed: SmoothedTrajectory) -> float:
 
     Orientation and velocities together outvote fixes whose map is another; 0 without a path.
     """
-    positions = smoothed.data.positions
-    if positions is None:
-        return 0.0
-    begin, end = smoothed.span_ns
-    inside = (positions.stamps_ns >= begin) & (positions.stamps_ns <= end)
-    stamps, fixes = positions.stamps_ns[inside], positions.position_map[inside]
-    later = np.searchsorted(stamps, stamps + PATH_NS)
-    first = np.flatnonzero(later < len(stamps))
-    if not len(first):
+    stamps, fixes, pieces = _pieces_of_fixes(smoothed)
+    if not len(pieces):
         return 0.0
     R, t = smoothed.poses_at(stamps)
     antenna = t + R @ smoothed.data.lever_arm
-    a, b = ((x[later[first]] - x[first])[:, :2] for x in (fixes, antenna))
+    a, b = ((x[pieces[:, 1]] - x[pieces[:, 0]])[:, :2] for x in (fixes, antenna))
     far = np.minimum(np.hypot(*a.T), np.hypot(*b.T)) > MIN_PATH_M
-    if not far.any():
-        return 0.0
-    a, b = a[far], b[far]
-    cross = float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
-    return math.atan2(cross, float((a * b).sum()))
+    return _turn_between(a[far], b[far], axis_only=False) if far.any() else 0.0
+
+
+def _pieces_of_fixes(smoothed: SmoothedTrajectory) -> tuple[IntArray, Array, IntArray]:
+    """Stamps (n,) and positions (n, 3) of the fixes, first and last (k, 2) of pieces of `PATH_NS`.
+
+    All of none without GNSS.
+    """
+    positions = smoothed.data.positions
+    if positions is None:
+        return np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 2), np.int64)
+    begin, end = smoothed.span_ns
+    inside = (positions.stamps_ns >= begin) & (positions.stamps_ns <= end)
+    stamps = positions.stamps_ns[inside]
+    later = np.searchsorted(stamps, stamps + PATH_NS)
+    first = np.flatnonzero(later < len(stamps))
+    return stamps, positions.position_map[inside], np.stack([first, later[first]], axis=1)
+
+
+def _turn_of_orientations(smoothed: SmoothedTrajectory, motion: MotionData) -> tuple[float, float]:
+    """Angle (rad) from the path of the fixes to that of the messages' orientations, and 1 sigma.
+
+    The vehicle goes where it points, or as measured velocities have it; nothing is smoothed. The
+    spread of the pieces tells the sigma. 0 without a path.
+    """
+    stamps, fixes, pieces = _pieces_of_fixes(smoothed)
+    moved = (fixes[pieces[:, 1]] - fixes[pieces[:, 0]])[:, :2]
+    far = np.hypot(*moved.T) > MIN_PATH_M
+    imu = motion.imu
+    if imu is None or imu.orientation_xyzw is None or not far.any():
+        return 0.0, 0.0
+    usable = usable_orientations(imu)
+    moved, pieces = moved[far], stamps[pieces[far]]
+    times = np.asarray(imu.stamps_ns[usable])
+    R = rotations_of(imu.orientation_xyzw[usable])
+    R = R @ smoothed.data.T_vehicle_imu.rotation().matrix().T
+    measured = _measured_at(motion, times, int(times[0]))
+    ahead = np.tile([1.0, 0.0], (len(R), 1)) if measured is None else measured
+    course = np.einsum("nij,nj->ni", R[:, :2, :2], ahead)
+    # The mean over a piece, as long as the fixes are apart; then what the antenna does in a turn.
+    sums = np.vstack([np.zeros(2), np.cumsum(course, axis=0)])
+    ends = np.searchsorted(times, pieces)
+    went = sums[ends[:, 1]] - sums[ends[:, 0]]
+    length = np.hypot(*moved.T) / np.maximum(np.hypot(*went.T), 1e-9)
+    arm = R @ smoothed.data.lever_arm
+    first, last = (np.minimum(ends[:, k], len(R) - 1) for k in (0, 1))
+    went = went * length[:, None] + (arm[last] - arm[first])[:, :2]
+    axis_only = measured is None
+    turn = _turn_between(moved, went, axis_only)
+    c, s = math.cos(turn), math.sin(turn)
+    along = moved @ np.array([[c, s], [-s, c]])  # turned as well: what is left is the spread
+    left = np.arctan2(along[:, 0] * went[:, 1] - along[:, 1] * went[:, 0], (along * went).sum(1))
+    if axis_only:
+        left = np.remainder(left + 0.5 * math.pi, math.pi) - 0.5 * math.pi
+    spans_ns = float(np.median(pieces[:, 1] - pieces[:, 0]))
+    independent = max(float(pieces[-1, 1] - pieces[0, 0]) / spans_ns, 1.0)
+    return turn, float(np.sqrt(np.mean(left**2) / independent))
 
 
 def _fit(

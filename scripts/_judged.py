@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gtsam
@@ -58,6 +58,22 @@ def sigmas_off(of: Mapping[str, Any]) -> list[float]:
 def nees_text(of: Mapping[str, Any]) -> str:
     """The NEES of a quantity and its number of axes, after a comma; empty if there is none."""
     return "" if of["nees"] is None else f", NEES {of['nees']:.1f} of {of['axes']}"
+
+
+def rows_of(outcome: Mapping[str, Any]) -> Iterator[str]:
+    """A line per S2V and S2S, then what the calibration says of itself."""
+    for name, of in outcome["errors"].items():
+        cells = [
+            f"{axis} {1e3 * error:.2f} ± {1e3 * sigma:.2f}"
+            for axis, error, sigma in zip(AXES, of["error"], of["sigma"], strict=True)
+            if error is not None
+        ]
+        far = f", worst {worst({name: of}):.1f} sigmas"
+        yield f"  {name} (mrad, mm): {', '.join(cells)}{nees_text(of)}{far}"
+    for text in outcome["undetermined"]:
+        yield f"  not determined: {text}"
+    for text in outcome["said"]:
+        yield f"  {text}"
 
 
 def _judged(

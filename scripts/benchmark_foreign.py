@@ -19,9 +19,8 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
 
@@ -33,14 +32,13 @@ from caliv_graph.batch.job import open_recordings, run_job
 from caliv_graph.common.exits import USAGE
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import load_config
-from caliv_graph.conventions import AXES
 from caliv_graph.errors import CalivError
 from caliv_graph.results.truth_file import read_truth
 from scripts._command import exit_code_of, positive
 from scripts._foreign_draws import EFFECTS, Draws
 from scripts._foreign_drives import SCENARIOS, simulate
 from scripts._foreign_random import in_words, random_scenario
-from scripts._judged import nees_text, outcome_of, worst
+from scripts._judged import outcome_of, rows_of
 
 OUT = REPOSITORY / "out" / "foreign"
 
@@ -108,22 +106,6 @@ def text_of(draws: Draws, folder: Path, keep: bool) -> str:
     if not keep:
         shutil.rmtree(folder / "drive")
     return "\n".join([f"{title}: exit {outcome['exit']}, {wall_s:.0f} s", *rows_of(outcome)])
-
-
-def rows_of(outcome: Mapping[str, Any]) -> Iterator[str]:
-    """A line per S2V and S2S, then what the calibration says of itself."""
-    for name, of in outcome["errors"].items():
-        cells = [
-            f"{axis} {1e3 * error:.2f} ± {1e3 * sigma:.2f}"
-            for axis, error, sigma in zip(AXES, of["error"], of["sigma"], strict=True)
-            if error is not None
-        ]
-        far = f", worst {worst({name: of}):.1f} sigmas"
-        yield f"  {name} (mrad, mm): {', '.join(cells)}{nees_text(of)}{far}"
-    for text in outcome["undetermined"]:
-        yield f"  not determined: {text}"
-    for text in outcome["said"]:
-        yield f"  {text}"
 
 
 if __name__ == "__main__":

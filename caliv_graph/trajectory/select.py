@@ -9,11 +9,11 @@ from typing import Protocol
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.interpolation import PoseCurve
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
 from caliv_graph.trajectory.given import error_covariances, given_trajectory
@@ -58,7 +58,7 @@ class VehicleTrajectory(Protocol):
 
 @dataclass(frozen=True)
 class GivenTrajectory:
-    """Given poses; between two of them angular velocity and velocity are constant.
+    """Given poses, and a smooth curve between them (`geometry.interpolation`).
 
     Attributes:
         trajectory: the poses at their own stamps, and the covariances that their messages state.
@@ -79,11 +79,10 @@ class GivenTrajectory:
         return int(self.trajectory.stamps_ns[0]), int(self.trajectory.stamps_ns[-1])
 
     @cached_property
-    def _knots(self) -> tuple[Array, Slerp, Array]:
+    def _curve(self) -> PoseCurve:
         begin, _ = self.span_ns
         seconds: Array = np.asarray(self.trajectory.stamps_ns - begin, np.float64) * 1e-9
-        R, t = stack(self.trajectory.T_map_vehicle)
-        return seconds, Slerp(seconds, Rotation.from_matrix(R)), t
+        return PoseCurve(seconds, *stack(self.trajectory.T_map_vehicle))
 
     def poses_at(self, stamps_ns: Sequence[int] | IntArray) -> tuple[Array, Array]:
         """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3), metres, at any times within the span.
@@ -92,10 +91,7 @@ class GivenTrajectory:
             TrajectoryError: a stamp is outside the span.
         """
         stamps = within_span(stamps_ns, self.span_ns, "the given poses")
-        seconds, turns, t = self._knots
-        s = (stamps - self.span_ns[0]) * 1e-9
-        position = np.stack([np.interp(s, seconds, axis) for axis in t.T], axis=1)
-        return np.asarray(turns(s).as_matrix()).reshape(-1, 3, 3), position
+        return self._curve.at(np.asarray((stamps - self.span_ns[0]) * 1e-9, np.float64))
 
     def error_covariances(self, stamps_ns: Sequence[int] | IntArray) -> Array | None:
         """`given.error_covariances` at stamps (m,) in any order.

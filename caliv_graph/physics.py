@@ -24,6 +24,7 @@ from caliv_graph.targets.cloud.copies import copies
 from caliv_graph.targets.ground.guesses import lidar_grounds, misfits
 from caliv_graph.trajectory.given_physics import impossible_speed, poses_physics
 from caliv_graph.trajectory.heading import heading_disagreement
+from caliv_graph.trajectory.outliers import lost_fixes
 from caliv_graph.trajectory.physics import motion_physics
 from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -33,6 +34,7 @@ from caliv_graph.wording.offsets import late_clock_sentences
 from caliv_graph.wording.physics import (
     copies_sentence,
     fast_finding,
+    fixes_finding,
     guess_findings,
     heading_finding,
     motion_findings,
@@ -92,6 +94,10 @@ def smoothed_findings(
     out: list[Finding] = []
     for index, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
         lies = False
+        if isinstance(trajectory, SmoothedTrajectory):
+            lost = lost_fixes(trajectory.data, trajectory.gnss_dropped)
+            if lost is not None:
+                out.append(fixes_finding(trajectory.data.name, lost))
         if not _is_of_wheels(trajectory):
             tilt = vehicle_tilt(trajectory, motions[index].name, config)
             found, lies = tilt_finding(tilt, config), tilt.lies

@@ -24,6 +24,10 @@ MAX_REJECTED = 0.4
 """Part of the fixes. If more exceed the limit, the stated noise is wrong, not the fixes: the median
 of the residuals is then no longer that of sound fixes."""
 
+MOST_DROPPED = 0.5
+"""Part of the fixes. If more were dropped after all, the rest is no majority: it is not known
+whether these fixes or those are right."""
+
 LIMIT_STEP = 9.0
 """Squared residuals down to a ninth of the largest (a third of its residual) are dropped at once.
 Larger steps drop sound fixes beside a jump; smaller ones cost rounds."""
@@ -89,6 +93,26 @@ def solve_without_outliers(
         data = replace(data, slow_orientation_rad=0.0)
         estimate = solve(data, nodes, states, dropped, kernel)
     return Robust(data, dropped, tuple(warnings)), estimate
+
+
+@dataclass(frozen=True)
+class LostFixes:
+    """Fixes of which most were dropped: `dropped` of `count`, each beyond `sigmas`."""
+
+    dropped: int
+    count: int
+    sigmas: float
+
+
+def lost_fixes(data: SmootherInput, dropped: IntArray) -> LostFixes | None:
+    """Whether most fixes of a drive were dropped (`MOST_DROPPED`); None if they were not.
+
+    `trimmed` drops as many as it is asked for, which says nothing.
+    """
+    count = 0 if data.positions is None else len(data.positions.stamps_ns)
+    if data.config.robust.kernel == "trimmed" or len(dropped) <= MOST_DROPPED * count:
+        return None
+    return LostFixes(len(dropped), count, math.sqrt(_final_limit(data.config)))
 
 
 def dropped_warnings(robust: Robust) -> list[str]:

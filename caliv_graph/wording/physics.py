@@ -26,6 +26,7 @@ from caliv_graph.trajectory.given_physics import (
     PosesPhysics,
 )
 from caliv_graph.trajectory.heading import HeadingDisagreement
+from caliv_graph.trajectory.outliers import LostFixes
 from caliv_graph.trajectory.physics import (
     Gravity,
     Misheading,
@@ -508,6 +509,21 @@ def tilt_finding(tilt: VehicleTilt, config: Config) -> Finding | None:
         f"{tilt.name}: the vehicle's axes are not level with the ground over the drive: {parts} "
         f"({sigmas:.0f} sigma). Roll and pitch of every LiDAR to the vehicle are off by as much: "
         f"{remedy}; if the vehicle frame is meant to lean, set ground.parallel_sigma_deg",
+    )
+
+
+def fixes_finding(name: str, found: LostFixes) -> Finding:
+    """Fixes of which the motion contradicts most."""
+    return Finding(
+        "gnss",
+        (),
+        0.0,
+        found.sigmas,
+        "contradiction",
+        f"{name}: {found.dropped} of {found.count} GNSS fixes disagree with the motion, each by "
+        f"more than {found.sigmas:.1f} sigma: with most of them dropped the vehicle's path is not "
+        "known. Check that latitude and longitude are in degrees, that the IMU's yaw counts from "
+        "east to the left, gnss.lever_arm, and the clocks of GNSS and IMU",
     )
 
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from caliv_graph.products import MotionData
+from caliv_graph.common.progress import SilentProgress
+from caliv_graph.physics import smoothed_findings
+from caliv_graph.products import MotionData, Recording
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -77,16 +81,24 @@ def test_a_vehicle_that_stands_shows_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("twist", "imu_hz", "wanted_hz", "against_fixes"),
+    ("twist", "imu_hz", "wanted_hz", "against_fixes", "most_dropped"),
     # With twice the samples and poses the solve of the first takes five times as long.
-    [(True, 50.0, 5.0, True), (False, 100.0, 10.0, False), (False, 50.0, 5.0, True)],
+    [
+        (True, 50.0, 5.0, True, False),
+        (False, 100.0, 10.0, False, False),
+        (False, 50.0, 5.0, True, True),
+    ],
     ids=["measured-lateral", "no-slip", "half-of-the-fixes-dropped"],
 )
 def test_a_compass_that_counts_from_north_is_told(
-    twist: bool, imu_hz: float, wanted_hz: float, against_fixes: bool
+    twist: bool, imu_hz: float, wanted_hz: float, against_fixes: bool, most_dropped: bool
 ) -> None:
     sensors = replace(Sensors(), yaw_bias_rad=math.radians(80.0), imu_hz=imu_hz)
-    found = compared(LONG_EIGHT, sensors, 1, twist, wanted_hz)
+    motion = record(LONG_EIGHT, sensors, 1)
+    motion = motion if twist else replace(motion, twist=None)
+    config = config_for(sensors, ground={"use": False})
+    smoothed = smooth_trajectory(motion, config, stamps(LONG_EIGHT.duration_s, wanted_hz))
+    found = heading_disagreement(smoothed, motion)
     assert found is not None
     # Where the rest outvotes the fixes, these tell with the orientations as they are: within them
     # alone the smoothed path is turned by 172 degrees in the last.
@@ -94,6 +106,11 @@ def test_a_compass_that_counts_from_north_is_told(
     assert found.sigma_rad < math.radians(2.0)
     assert found.warning
     assert ("against the path of the GNSS fixes" in found.warning) == against_fixes
+    recording = cast("Recording", SimpleNamespace(name="drive"))
+    said = smoothed_findings([recording], [smoothed], {0: motion}, config, SilentProgress())
+    lost = [each for each in said if each.input == "gnss"]
+    assert [each.severity for each in lost] == ["contradiction"] * most_dropped
+    assert all("GNSS fixes disagree with the motion" in each.sentence for each in lost)
 
 
 def test_driving_backwards_is_no_disagreement() -> None:

@@ -20,6 +20,7 @@ from caliv_graph.trajectory import uncertain
 from caliv_graph.trajectory.build import TrajectoryGraph
 from caliv_graph.trajectory.factors import marginal_factor
 from caliv_graph.trajectory.nodes import place_nodes
+from caliv_graph.trajectory.outliers import lost_fixes
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import solve
@@ -407,6 +408,15 @@ def test_fixes_that_jump_are_dropped(kernel: str) -> None:
     assert position_rmse(shift) < 12e-3
     assert nees.mean() < 10.0
     assert "GNSS fixes disagree with the motion, dropped" in smoothed.warnings[-1]
+    # A minority is no finding; of most it is not known whether they or the rest are right.
+    assert smoothed.data.positions is not None
+    half = len(smoothed.data.positions.stamps_ns) // 2
+    assert lost_fixes(smoothed.data, np.arange(half)) is None
+    lost = lost_fixes(smoothed.data, np.arange(half + 1))
+    assert lost is not None
+    assert (lost.dropped, lost.count) == (half + 1, len(smoothed.data.positions.stamps_ns))
+    trimmed = replace(smoothed.data, config=config_for(AWKWARD, robust={"kernel": "trimmed"}))
+    assert lost_fixes(trimmed, np.arange(half + 1)) is None
 
 
 def tilting(motion: MotionData, tilt_rad: float) -> MotionData:

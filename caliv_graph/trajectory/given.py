@@ -4,10 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
+from caliv_graph.geometry.interpolation import PoseCurve
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, MotionData, Trajectory
 from caliv_graph.trajectory.noise import stated
+
+RARE_S, ROUGH_M = 0.2, 2e-3
+"""Poses farther apart in time, between which the path is known no better, are told: to a scan that
+is an error as large as those of good poses."""
+
+FEWEST_POSES = 8
+"""Poses from which that can be said."""
+
+HALVING = 10.0
+"""Error of the curve midway between poses, over its root mean square between poses half as far
+apart: 8 to 20 on drives with curves of 9 m (chords: 5)."""
 
 
 def given_trajectory(motion: MotionData) -> Trajectory:
@@ -25,6 +38,27 @@ def given_trajectory(motion: MotionData) -> Trajectory:
             "Choose another topics.pose or data.poses"
         )
     return Trajectory(poses.stamps_ns, poses.T_map_vehicle, poses.cov)
+
+
+def rare_poses(trajectory: Trajectory, stamps_ns: IntArray) -> tuple[float, float] | None:
+    """Usual seconds between given poses, and 1 sigma (m) of the path there, if that is rough.
+
+    Every second pose is left out, and the curve through the others compared with it. None if poses
+    are frequent (`RARE_S`), the path smooth (`ROUGH_M`), or all scans, at `stamps_ns` (m,), are at
+    poses.
+    """
+    own = trajectory.stamps_ns
+    step_s = float(np.median(np.diff(own))) / NANOSECONDS_PER_SECOND
+    between = stamps_ns[(stamps_ns > own[0]) & (stamps_ns < own[-1])]
+    if step_s <= RARE_S or len(own) < FEWEST_POSES or np.isin(between, own).all():
+        return None
+    seconds = (own - own[0]) / NANOSECONDS_PER_SECOND
+    R, t = stack(trajectory.T_map_vehicle)
+    left_out = np.arange(1, len(own) - 1, 2)
+    kept = np.setdiff1d(np.arange(len(own)), left_out)
+    _, found = PoseCurve(seconds[kept], R[kept], t[kept]).at(seconds[left_out])
+    sigma_m = float(np.sqrt(np.mean(np.sum((found - t[left_out]) ** 2, axis=1)))) / HALVING
+    return (step_s, sigma_m) if sigma_m > ROUGH_M else None
 
 
 def error_covariances(trajectory: Trajectory, stamps_ns: IntArray) -> Array | None:

@@ -16,7 +16,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.interpolation import PoseCurve
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
-from caliv_graph.trajectory.given import error_covariances, given_trajectory
+from caliv_graph.trajectory.given import error_covariances, given_trajectory, rare_poses
 from caliv_graph.trajectory.noise import stated
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.smooth import smooth_trajectory
@@ -186,6 +186,13 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
         warnings.append(
             f"{motion.name}: {unknown} of {count} vehicle poses state no covariance: their white "
             "error is estimated"
+        )
+    rare = rare_poses(trajectory, stamps)
+    if rare is not None:
+        step_s, sigma_m = rare
+        warnings.append(
+            f"{motion.name}: the vehicle's poses come every {step_s:.2g} s: at the scans between "
+            f"them its path is known to about {1e3 * sigma_m:.0f} mm. Give poses more often"
         )
     odometry = motion.poses if isinstance(motion.poses, OdometryPoses) else None
     return GivenTrajectory(trajectory, tuple(lost.tolist()), tuple(warnings), odometry)

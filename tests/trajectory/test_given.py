@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import gtsam
 import numpy as np
 import pytest
 
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import Array, GivenPoses, MotionData, Trajectory
+from caliv_graph.products import Array, GivenPoses, MotionData, Recording, Trajectory
 from caliv_graph.trajectory.given import given_trajectory
 from caliv_graph.trajectory.noise import (
     MIN_POSE_POSITION_M,
@@ -139,3 +142,43 @@ def test_messages_that_state_none_among_others_are_reported() -> None:
     ):
         (given,) = smooth_trajectories([PosesOnly(*covs)], config_for(Sensors()), [[0]])  # type: ignore[list-item]
         assert given.warnings == lines
+
+
+def weaving(period_s: float) -> GivenPoses:
+    """Exact poses of a vehicle that weaves at 2.7 m/s, its tightest curve of 7.5 m, 20.5 s."""
+    stamps = np.arange(0, 20_500_000_000, round(1e9 * period_s), dtype=np.int64)
+    at = np.arange(0.0, 20.5, 1e-3)
+    x, y = (2.7e-3 * np.cumsum(f(1.2 * np.sin(0.3 * at))) for f in (np.cos, np.sin))
+    return GivenPoses(
+        stamps,
+        tuple(
+            gtsam.Pose3(
+                gtsam.Rot3.Yaw(1.2 * np.sin(0.3 * s)),
+                np.array([np.interp(s, at, x), np.interp(s, at, y), 0.0]),
+            )
+            for s in (1e-9 * stamps).tolist()
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("period_s", "scans_s", "told"),
+    [(2.0, 0.1, True), (0.2, 0.1, False), (2.0, 2.0, False)],
+    ids=["rare", "frequent", "at-the-scans"],
+)
+def test_poses_too_rare_for_the_scans_between_them_are_told(
+    period_s: float, scans_s: float, told: bool
+) -> None:
+    motion = MotionData("drive/", poses=weaving(period_s))
+    wanted = np.arange(0, 18_000_000_001, round(1e9 * scans_s), dtype=np.int64)
+    nothing = cast("Recording", SimpleNamespace())
+    (found,) = smooth_trajectories([nothing], config_for(Sensors()), [wanted], {0: motion})
+
+    assert ["poses come every 2 s" in line for line in found.warnings] == [True] * told
+    if told:
+        _, true_m = GivenTrajectory(given_trajectory(MotionData("", poses=weaving(0.02)))).poses_at(
+            wanted
+        )
+        error_m = np.linalg.norm(found.poses_at(wanted)[1] - true_m, axis=1)
+        said_mm = float(found.warnings[0].split("to about ")[1].split(" mm")[0])
+        assert 0.5 < said_mm / (1e3 * np.sqrt(np.mean(error_m**2))) < 2.0

@@ -12,14 +12,19 @@ from scipy.spatial.transform import Rotation
 from caliv_graph.geometry.se3 import cross
 from caliv_graph.products import Array
 
-MOST_M_S2, MOST_RAD_S2 = 20.0, 20.0
-"""A larger acceleration at a pose is no motion of a vehicle but a jump of its poses, or their
-noise: there the neighbouring pieces do not know of each other. Potholes have 10 m/s^2, for a time
-that no pose resolves."""
+MOST_M_S3, MOST_RAD_S3 = 20.0, 20.0
+"""Accelerations of neighbouring poses that differ by more than this for each second between them,
+and by more than `MOST_TIMES_USUAL`, are no motion of a vehicle but a jump of its poses: pieces
+beside it do not know of each other. A body that heaves by 2 m/s^2 at 1.5 Hz has as much."""
 
-MOST_TIMES_LONGER = 3.0
+MOST_TIMES_USUAL = 4.0
+"""Times the median over a drive: noise of the poses has its own such differences, and is exceeded
+once in 10^8. Chords would cut curves there as well."""
+
+MOST_TIMES_LONGER = 2.5
 """A piece that is longer than its neighbour by more has no velocity from it: noise of the poses
-in that, times its own length, is more than what it bends."""
+in that, times its own length, is more than what it bends. One missing pose makes white noise 1.07
+times that of a pose, two would make it 1.22."""
 
 
 class PoseCurve:
@@ -27,15 +32,15 @@ class PoseCurve:
 
     The velocity at a pose is that of the parabola through it and its neighbours; between two poses
     a cubic polynomial has their values and velocities, of the position and of the rotation vector
-    from the first. Where that asks for more than `MOST_M_S2` or `MOST_RAD_S2`, or pieces are too
-    unlike (`MOST_TIMES_LONGER`), each has its own mean velocity.
+    from the first. Where poses jump (`MOST_M_S3`, `MOST_RAD_S3`), or pieces are too unlike
+    (`MOST_TIMES_LONGER`), each has its own mean velocity.
     """
 
     def __init__(self, seconds: Array, R: Array, t: Array) -> None:
         """Binds n poses, two at least.
 
         Args:
-            seconds: (n,) their times, ascending.
+            seconds: (n,) their times, strictly ascending.
             R: (n, 3, 3) R_map_vehicle.
             t: (n, 3) t_map_vehicle, metres.
         """
@@ -44,11 +49,11 @@ class PoseCurve:
         turns = np.swapaxes(R[:-1], 1, 2) @ R[1:]
         self._turned = Rotation.from_matrix(turns).as_rotvec()
         # Rotation vectors from a pose to its neighbours: minus the turn since the one before.
-        begin, end = _velocities(self._turned / self._steps[:, None], self._steps, MOST_RAD_S2)
+        begin, end = _velocities(self._turned / self._steps[:, None], self._steps, MOST_RAD_S3)
         self._turning = begin, _as_change(self._turned, end)
         moved = np.diff(t, axis=0)
         self._moved = moved
-        self._moving = _velocities(moved / self._steps[:, None], self._steps, MOST_M_S2)
+        self._moving = _velocities(moved / self._steps[:, None], self._steps, MOST_M_S3)
 
     def at(self, seconds: Array) -> tuple[Array, Array]:
         """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) at times (m,) within the poses' span."""
@@ -80,8 +85,10 @@ def _velocities(mean: Array, steps: Array, most: float) -> tuple[Array, Array]:
         return begin, end
     h0, h1 = steps[:-1, None], steps[1:, None]
     half = (mean[1:] - mean[:-1]) / (h0 + h1)  # of the acceleration
-    smooth = 2.0 * np.linalg.norm(half, axis=1) < most
-    half = half * smooth[:, None]
+    change = 2.0 * np.linalg.norm(np.diff(half, axis=0), axis=1)
+    usual = float(np.median(change)) if len(change) else 0.0
+    jumps = change > np.maximum(most * steps[1:-1], MOST_TIMES_USUAL * usual)
+    half[np.append(jumps, False) | np.append(False, jumps)] = 0.0
     before = h0 * half * (h0 <= MOST_TIMES_LONGER * h1)
     after = h1 * half * (h1 <= MOST_TIMES_LONGER * h0)
     end[:-1] += before

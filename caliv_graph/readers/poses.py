@@ -6,8 +6,9 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
+from caliv_graph.geometry.interpolation import PoseCurve
 from caliv_graph.products import Array, GivenPoses, IntArray, PoseFrame
 from caliv_graph.readers.collectors import (
     MOST_M,
@@ -196,10 +197,13 @@ def poses_of(t: Array, q_xyzw: Array) -> tuple[gtsam.Pose3, ...]:
 
 
 def _interpolated(stamps: IntArray, rows: Array, at_ns: IntArray) -> tuple[Rotation, Array]:
-    """Rotation and translation (n, 3) of a link at other stamps, none outside its own."""
+    """Rotation and translation (n, 3) of a link at other stamps, none outside its own.
+
+    On a curve: a vehicle moves by it. A link that corrects a map jumps, and the curve with it.
+    """
     if len(stamps) == 1:
         return Rotation.from_quat(rows[0, 3:]), rows[0, :3]
     # Seconds from the first: a float cannot resolve nanoseconds in numbers this large.
     own_s, at_s = (stamps - stamps[0]) * 1e-9, (at_ns - stamps[0]) * 1e-9
-    t = np.stack([np.interp(at_s, own_s, rows[:, axis]) for axis in range(3)], axis=1)
-    return Slerp(own_s, Rotation.from_quat(rows[:, 3:]))(at_s), t
+    R, t = PoseCurve(own_s, Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3]).at(at_s)
+    return Rotation.from_matrix(R), t

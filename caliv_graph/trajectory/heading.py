@@ -108,10 +108,13 @@ def heading_disagreement(
         return None
     measured = _measured_at(motion, at[fast], begin)
     map_turn, source = _turn_against_fixes(smoothed), _source(smoothed)
-    sigma = _heading_sigma(smoothed)
+    sigma, driving = _heading_sigma(smoothed), ""
     if abs(map_turn) > MAP_TURN_RAD and source == "imu":
         # Where fixes were dropped for it, the smoothed path may go anywhere.
-        map_turn, sigma = _turn_of_orientations(smoothed, motion)
+        turn, spread = _turn_of_orientations(smoothed, motion)
+        if abs(turn) > MAP_TURN_RAD:
+            map_turn, sigma = turn, spread
+            driving = "" if motion.twist is not None else " of a vehicle that drives forward"
     if abs(map_turn) > MAP_TURN_RAD:
         return HeadingDisagreement(
             yaw_rad=map_turn,
@@ -122,14 +125,14 @@ def heading_disagreement(
             source=source,
             warning=(
                 f"{motion.name}: heading is turned by {math.degrees(map_turn):+.0f} degrees "
-                "against the path of the GNSS fixes, which hardly count therefore. "
+                f"against the path of the GNSS fixes{driving}, which hardly count therefore. "
                 f"{_MAP_REMEDIES[source]}"
             ),
         )
     velocity, turn = velocity[fast, :2], rates[fast, 2]
-    along = np.tile([1.0, 0.0], (len(turn), 1)) if measured is None else measured
+    along = _ahead(motion, at[fast], begin) if measured is None else measured
     # The coarse part may be a right angle (north instead of east); the rest is small.
-    coarse = _turn_between(velocity, along, axis_only=measured is None)
+    coarse = _turn_between(velocity, along, axis_only=motion.twist is None)
     c, s = math.cos(coarse), math.sin(coarse)
     forward = c * velocity[:, 0] - s * velocity[:, 1]
     sideways = s * velocity[:, 0] + c * velocity[:, 1]
@@ -201,43 +204,69 @@ def _pieces_of_fixes(smoothed: SmoothedTrajectory) -> tuple[IntArray, Array, Int
 
 
 def _turn_of_orientations(smoothed: SmoothedTrajectory, motion: MotionData) -> tuple[float, float]:
+    """`turn_of_orientations` of a drive; zeros where they do not tell it."""
+    stamps, fixes, pieces = _pieces_of_fixes(smoothed)
+    imu, data = motion.imu, smoothed.data
+    usable = np.zeros(0, bool) if imu is None else usable_orientations(imu)
+    if imu is None or imu.orientation_xyzw is None or not usable.any():
+        return 0.0, 0.0
+    times = np.asarray(imu.stamps_ns[usable])
+    R = rotations_of(imu.orientation_xyzw[usable]) @ data.T_vehicle_imu.rotation().matrix().T
+    velocity = _speeds_at(motion, times, int(times[0]))
+    return turn_of_orientations(
+        times, R, velocity, stamps[pieces], fixes[pieces], np.asarray(data.lever_arm)
+    )
+
+
+def turn_of_orientations(
+    times_ns: IntArray,
+    R_map_vehicle: Array,
+    velocity: Array | None,
+    pieces_ns: IntArray,
+    pieces_map: Array,
+    lever_arm: Array,
+) -> tuple[float, float]:
     """Angle (rad) from the path of the fixes to that of the messages' orientations, and 1 sigma.
 
-    The vehicle goes where it points, or as measured velocities have it; nothing is smoothed. The
-    spread of the pieces tells the sigma. 0 without a path.
+    Nothing is smoothed. The spread of the pieces tells the sigma. Zeros without a path.
+
+    Args:
+        times_ns: (n,) stamps of the orientations, ascending.
+        R_map_vehicle: (n, 3, 3) by the orientations.
+        velocity: (n, 2) of the vehicle's origin, m/s, vehicle axes; None: it drives forward.
+        pieces_ns: (k, 2) stamps of first and last fix of pieces of the path.
+        pieces_map: (k, 2, 3) these fixes, metres.
+        lever_arm: (3,) antenna in the vehicle frame, metres.
     """
-    stamps, fixes, pieces = _pieces_of_fixes(smoothed)
-    moved = (fixes[pieces[:, 1]] - fixes[pieces[:, 0]])[:, :2]
-    far = np.hypot(*moved.T) > MIN_PATH_M
-    imu = motion.imu
-    if imu is None or imu.orientation_xyzw is None or not far.any():
+    ahead = np.tile([1.0, 0.0], (len(times_ns), 1)) if velocity is None else velocity
+    course = np.einsum("nij,nj->ni", R_map_vehicle[:, :2, :2], ahead)
+    steps = 0.5e-9 * np.diff(times_ns)[:, None] * (course[1:] + course[:-1])
+    ways = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+    ends = np.minimum(np.searchsorted(times_ns, pieces_ns), len(times_ns) - 1)
+    moved = (pieces_map[:, 1] - pieces_map[:, 0])[:, :2]
+    told = (pieces_ns[:, 0] >= times_ns[0]) & (pieces_ns[:, 1] <= times_ns[-1])
+    told &= (np.hypot(*moved.T) > MIN_PATH_M) & (ends[:, 0] < ends[:, 1])
+    went = ways[ends[:, 1]] - ways[ends[:, 0]]
+    arm = (R_map_vehicle @ lever_arm)[:, :2]
+    turned = arm[ends[:, 1]] - arm[ends[:, 0]]
+    if velocity is None:
+        # As long as makes the antenna's way, with what it does in a turn, that of the fixes.
+        a, b = np.sum(went**2, axis=1), np.sum(went * turned, axis=1)
+        root = b**2 - a * (np.sum(turned**2, axis=1) - np.sum(moved**2, axis=1))
+        told &= (a > 0.0) & (root > 0.0)
+        scale = np.sqrt(np.maximum(root, 0.0)) - b
+        went = went * (scale / np.where(a > 0.0, a, 1.0))[:, None]
+    if not told.any():
         return 0.0, 0.0
-    usable = usable_orientations(imu)
-    moved, pieces = moved[far], stamps[pieces[far]]
-    times = np.asarray(imu.stamps_ns[usable])
-    R = rotations_of(imu.orientation_xyzw[usable])
-    R = R @ smoothed.data.T_vehicle_imu.rotation().matrix().T
-    measured = _measured_at(motion, times, int(times[0]))
-    ahead = np.tile([1.0, 0.0], (len(R), 1)) if measured is None else measured
-    course = np.einsum("nij,nj->ni", R[:, :2, :2], ahead)
-    # The mean over a piece, as long as the fixes are apart; then what the antenna does in a turn.
-    sums = np.vstack([np.zeros(2), np.cumsum(course, axis=0)])
-    ends = np.searchsorted(times, pieces)
-    went = sums[ends[:, 1]] - sums[ends[:, 0]]
-    length = np.hypot(*moved.T) / np.maximum(np.hypot(*went.T), 1e-9)
-    arm = R @ smoothed.data.lever_arm
-    first, last = (np.minimum(ends[:, k], len(R) - 1) for k in (0, 1))
-    went = went * length[:, None] + (arm[last] - arm[first])[:, :2]
-    axis_only = measured is None
-    turn = _turn_between(moved, went, axis_only)
+    moved, went = moved[told], (went + turned)[told]
+    turn = _turn_between(moved, went, axis_only=False)
     c, s = math.cos(turn), math.sin(turn)
     along = moved @ np.array([[c, s], [-s, c]])  # turned as well: what is left is the spread
     left = np.arctan2(along[:, 0] * went[:, 1] - along[:, 1] * went[:, 0], (along * went).sum(1))
-    if axis_only:
-        left = np.remainder(left + 0.5 * math.pi, math.pi) - 0.5 * math.pi
-    spans_ns = float(np.median(pieces[:, 1] - pieces[:, 0]))
-    independent = max(float(pieces[-1, 1] - pieces[0, 0]) / spans_ns, 1.0)
-    return turn, float(np.sqrt(np.mean(left**2) / independent))
+    lengths_ns = np.diff(pieces_ns[told], axis=1)
+    spacing_ns = np.diff(pieces_ns[told, 0], append=pieces_ns[told][-1:, 0])
+    covered = np.minimum(spacing_ns, lengths_ns[:, 0]).sum() / np.median(lengths_ns)
+    return turn, float(np.sqrt(np.mean(left**2) / max(float(covered), 1.0)))
 
 
 def _fit(
@@ -274,6 +303,20 @@ def _or_axle(yaw: float, forward: Array, turn: Array, separated: bool) -> str:
 def _measured_at(motion: MotionData, stamps_ns: IntArray, begin_ns: int) -> Array | None:
     """(n, 2) measured velocities; None if the lateral one is not: odometry sets it to 0."""
     if motion.twist is None or is_planar(motion.twist):
+        return None
+    return _speeds_at(motion, stamps_ns, begin_ns)
+
+
+def _ahead(motion: MotionData, stamps_ns: IntArray, begin_ns: int) -> Array:
+    """(n, 2) forward or backward, by odometry; forward without it."""
+    out = np.tile([1.0, 0.0], (len(stamps_ns), 1))
+    speeds = _speeds_at(motion, stamps_ns, begin_ns)
+    return out if speeds is None else out * np.sign(speeds[:, :1])
+
+
+def _speeds_at(motion: MotionData, stamps_ns: IntArray, begin_ns: int) -> Array | None:
+    """(n, 2) velocities of the messages, forward and to the left; None without them."""
+    if motion.twist is None:
         return None
     finite = np.isfinite(motion.twist.velocity).all(axis=1)
     velocity = motion.twist.velocity[finite, :2]

@@ -28,6 +28,9 @@ MOST_DROPPED = 0.5
 """Part of the fixes. If more were dropped after all, the rest is no majority: it is not known
 whether these fixes or those are right."""
 
+FEWEST_FIXES = 8
+"""Fixes from which that is said."""
+
 LIMIT_STEP = 9.0
 """Squared residuals down to a ninth of the largest (a third of its residual) are dropped at once.
 Larger steps drop sound fixes beside a jump; smaller ones cost rounds."""
@@ -107,10 +110,14 @@ class LostFixes:
 def lost_fixes(data: SmootherInput, dropped: IntArray) -> LostFixes | None:
     """Whether most fixes of a drive were dropped (`MOST_DROPPED`); None if they were not.
 
-    `trimmed` drops as many as it is asked for, which says nothing.
+    `trimmed` drops as many as it is asked for, and `tls` what it expects of sound ones: that says
+    nothing. Nor do a few fixes.
     """
+    robust = data.config.robust
     count = 0 if data.positions is None else len(data.positions.stamps_ns)
-    if data.config.robust.kernel == "trimmed" or len(dropped) <= MOST_DROPPED * count:
+    expected = robust.tls_p_value if robust.kernel == "tls" else 0.0
+    most = (MOST_DROPPED + expected) * count
+    if robust.kernel == "trimmed" or count < FEWEST_FIXES or len(dropped) <= most:
         return None
     return LostFixes(len(dropped), count, math.sqrt(_final_limit(data.config)))
 

@@ -51,7 +51,7 @@ def test_it_goes_through_its_poses_however_they_are_spaced() -> None:
 
 
 def test_unequal_pieces_of_one_acceleration_and_angular_acceleration_are_exact() -> None:
-    seconds = np.array([0.0, 0.1, 0.25, 0.31, 0.48])
+    seconds = np.array([0.0, 0.1, 0.25, 0.32, 0.48])
     at = np.linspace(0.0, 0.48, 97)
 
     def motion(s: Array) -> tuple[Array, Array]:
@@ -83,17 +83,37 @@ def test_velocities_are_continuous_where_pieces_meet_also_of_rotations_about_cha
         assert after == pytest.approx(before, abs=1e-4)
 
 
-def test_a_jump_of_the_poses_bends_no_piece_beside_it() -> None:
-    seconds = np.arange(0.0, 2.0, 0.1)
+def test_curves_are_not_cut_beside_noise_either() -> None:
+    """Noise of 5 mm has accelerations of metres per second squared at 10 Hz: no jumps."""
+    rng = np.random.default_rng(5)
+    seconds = np.arange(0.0, 400.0, 0.1)
+    R, t = circle(seconds)
+    _, found = PoseCurve(seconds, R, t + rng.normal(0.0, 0.005, t.shape)).at(seconds[5:-5] + 0.05)
+    centre = np.array([0.0, RADIUS_M])
+    outside = np.linalg.norm(found[:, :2] - centre, axis=1) - RADIUS_M
+    assert outside.mean() == pytest.approx(0.0, abs=3e-4)  # a chord: -2.5 mm; of 4000: 0.06
+
+
+@pytest.mark.parametrize(("period_s", "jump"), [(0.1, 0.02), (0.2, 0.1), (0.5, 1.3)])
+def test_a_jump_of_the_poses_bends_no_piece_beside_it(period_s: float, jump: float) -> None:
+    """Of fixes that lose their ambiguities, or a map that is corrected; by metres and by radians.
+
+    Twice the jump over the square of a period is the change of acceleration: 20 per second of it.
+    """
+    seconds = period_s * np.arange(20.0)
     place = np.outer(seconds, [4.0, 0.0, 0.0])
-    place[10:, 1] += 1.0
+    place[10:, 1] += jump
     turn = np.zeros((20, 3))
-    turn[10:, 2] = 0.5
-    R, t = PoseCurve(seconds, Rotation.from_rotvec(turn).as_matrix(), place).at(
-        np.array([0.85, 1.05])
-    )
-    assert t[:, 1] == pytest.approx([0.0, 1.0], abs=1e-12)
-    assert Rotation.from_matrix(R).as_rotvec()[:, 2] == pytest.approx([0.0, 0.5], abs=1e-9)
+    turn[10:, 2] = jump
+    at = period_s * np.array([8.5, 10.5])
+    R, t = PoseCurve(seconds, Rotation.from_rotvec(turn).as_matrix(), place).at(at)
+    assert t[:, 1] == pytest.approx([0.0, jump], abs=1e-12)
+    assert Rotation.from_matrix(R).as_rotvec()[:, 2] == pytest.approx([0.0, jump], abs=1e-9)
+
+    # Half of it might be motion: it bends its neighbours, by a sixteenth of it.
+    place[10:, 1] -= 0.6 * jump
+    _, t = PoseCurve(seconds, np.tile(np.eye(3), (20, 1, 1)), place).at(at)
+    assert t[0, 1] == pytest.approx(-0.4 * jump / 16.0, rel=1e-6)
 
 
 def test_noise_of_poses_is_not_made_larger_in_a_gap_between_them() -> None:

@@ -32,7 +32,7 @@ EXPECTED = {
     "gravity the other way": (2, "disagree by 180 degrees on where up is"),
     "IMU with z down": (2, "on where up is"),
     "orientation w first": (2, "on where up is"),
-    "latitude in radians": (2, ""),
+    "latitude in radians": (2, "Check that latitude and longitude are in degrees"),
     "latitude and longitude swapped": (2, "latitude and longitude are"),
     "clouds left-handed": (2, ""),
     "clouds upside down": (2, ""),

@@ -10,11 +10,16 @@ from typing import cast
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.physics import smoothed_findings
 from caliv_graph.products import MotionData, Recording
-from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
+from caliv_graph.trajectory.heading import (
+    HeadingDisagreement,
+    heading_disagreement,
+    turn_of_orientations,
+)
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.tilt import vehicle_tilt
@@ -80,6 +85,20 @@ def test_a_vehicle_that_stands_shows_nothing() -> None:
     assert compared(Course(arc_drive(4.0)), Sensors(), 0, True) is None
 
 
+def test_a_compass_that_is_off_by_more_than_a_right_angle_is_told_with_its_sign() -> None:
+    """Odometry, whose lateral velocity is none, says that the vehicle goes forward."""
+    sensors = replace(mounted_askew(), yaw_bias_rad=math.radians(120.0), imu_hz=50.0)
+    motion = record(LONG_EIGHT, sensors, 1)
+    assert motion.twist is not None
+    ahead = motion.twist.velocity * [1.0, 0.0, 0.0]
+    motion = replace(motion, twist=replace(motion.twist, velocity=ahead))
+    wanted = stamps(LONG_EIGHT.duration_s, 5.0)
+    found = heading_disagreement(smooth_trajectory(motion, config_for(sensors), wanted), motion)
+    assert found is not None
+    assert math.degrees(found.yaw_rad) == pytest.approx(120.0, abs=3.0)
+    assert "heading is turned by +1" in found.warning
+
+
 @pytest.mark.parametrize(
     ("twist", "imu_hz", "wanted_hz", "against_fixes", "most_dropped"),
     # With twice the samples and poses the solve of the first takes five times as long.
@@ -108,7 +127,7 @@ def test_a_compass_that_counts_from_north_is_told(
     assert ("against the path of the GNSS fixes" in found.warning) == against_fixes
     recording = cast("Recording", SimpleNamespace(name="drive"))
     said = smoothed_findings([recording], [smoothed], {0: motion}, config, SilentProgress())
-    lost = [each for each in said if each.input == "gnss"]
+    lost = [each for each in said if each.input.startswith("topics.gnss")]
     assert [each.severity for each in lost] == ["contradiction"] * most_dropped
     assert all("GNSS fixes disagree with the motion" in each.sentence for each in lost)
 
@@ -162,3 +181,43 @@ def test_heading_and_tilt_have_the_sigma_of_the_poses_whichever_are_wanted(
     assert found.sigma_rad == pytest.approx(expected.sigma_rad, rel=0.1)
     tilts = [vehicle_tilt(each, "drive", config).sigma_rad for each in (every, few)]
     assert tilts[1] == pytest.approx(tilts[0], rel=0.1)
+
+
+@pytest.mark.parametrize("turn_deg", [30.0, 120.0, -80.0])
+@pytest.mark.parametrize(
+    ("speed_m_s", "measured"),
+    [(1.0, False), (1.0, True), (-1.0, True)],
+    ids=["forward", "speeds", "backwards"],
+)
+def test_orientations_that_are_turned_are_told_whatever_the_antenna_does(
+    turn_deg: float, speed_m_s: float, measured: bool
+) -> None:
+    """On a circle of one side, where an arm of 1.6 m that is left out is 7 degrees."""
+    arm, rate = np.array([1.5, 0.4, 0.8]), 0.3
+    times = np.arange(0, 60_000_000_000, 20_000_000, dtype=np.int64)
+    yaw = rate * 1e-9 * times
+    around = Rotation.from_rotvec(np.outer(yaw, [0.0, 0.0, 1.0]))
+    place = speed_m_s / rate * np.stack([np.sin(yaw), -np.cos(yaw), 0.0 * yaw], axis=1)
+    antenna = place + around.apply(arm)
+    said = Rotation.from_rotvec([0.0, 0.0, math.radians(turn_deg)]) * around
+    first = np.arange(0, len(times) - 100, 10)
+    pieces = np.stack([first, first + 100], axis=1)
+    velocity = np.tile([speed_m_s, 0.0], (len(times), 1)) if measured else None
+
+    # Messages begin after a third of the drive: pieces before have nothing to say.
+    late = slice(1000, None)
+    turn, sigma = turn_of_orientations(
+        times[late],
+        said.as_matrix()[late],
+        None if velocity is None else velocity[late],
+        times[pieces],
+        antenna[pieces],
+        arm,
+    )
+
+    assert math.degrees(turn) == pytest.approx(turn_deg, abs=0.1)
+    assert sigma < 1e-3
+    nothing = turn_of_orientations(
+        times[:2], said.as_matrix()[:2], None, times[pieces[:0]], antenna[pieces[:0]], arm
+    )
+    assert nothing == (0.0, 0.0)

@@ -415,6 +415,8 @@ def test_fixes_that_jump_are_dropped(kernel: str) -> None:
     lost = lost_fixes(smoothed.data, np.arange(half + 1))
     assert lost is not None
     assert (lost.dropped, lost.count) == (half + 1, len(smoothed.data.positions.stamps_ns))
+    few = replace(smoothed.data.positions, stamps_ns=smoothed.data.positions.stamps_ns[:7])
+    assert lost_fixes(replace(smoothed.data, positions=few), np.arange(7)) is None
     trimmed = replace(smoothed.data, config=config_for(AWKWARD, robust={"kernel": "trimmed"}))
     assert lost_fixes(trimmed, np.arange(half + 1)) is None
 

@@ -24,6 +24,7 @@ from scripts._foreign_lidar import Kind, Lidar, Scene, Sweep, scan
 from scripts._foreign_random import in_words, random_scenario
 from scripts._foreign_vehicle import Gnss, Imu, Motion, measure_gnss, measure_imu
 from scripts._foreign_world import Array, Grass, Ground, Mesh
+from scripts._judged import rows_of
 
 SCRIPTS = Path(benchmark.__file__).parent
 WALL_X_M = 8.0
@@ -194,7 +195,7 @@ def test_the_errors_of_a_run_are_shown_with_sigmas() -> None:
     of = {"error": [1e-3] * 5 + [None], "sigma": [5e-4] * 6, "nees": 20.0, "axes": 5}
     outcome = {"errors": {"S2V front": of}, "undetermined": ["height"], "said": []}
 
-    row, undetermined = benchmark.rows_of(outcome)
+    row, undetermined = rows_of(outcome)
 
     assert "roll 1.00 ± 0.50" in row
     assert "z " not in row

@@ -97,7 +97,7 @@ def smoothed_findings(
         if isinstance(trajectory, SmoothedTrajectory):
             lost = lost_fixes(trajectory.data, trajectory.gnss_dropped)
             if lost is not None:
-                has_imu = trajectory.data.wheels is None
+                has_imu = not _is_of_wheels(trajectory)
                 out.append(fixes_finding(trajectory.data.name, lost, has_imu))
         if not _is_of_wheels(trajectory):
             tilt = vehicle_tilt(trajectory, motions[index].name, config)

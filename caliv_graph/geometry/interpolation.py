@@ -51,9 +51,8 @@ class PoseCurve:
         # Rotation vectors from a pose to its neighbours: minus the turn since the one before.
         begin, end = _velocities(self._turned / self._steps[:, None], self._steps, MOST_RAD_S3)
         self._turning = begin, _as_change(self._turned, end)
-        moved = np.diff(t, axis=0)
-        self._moved = moved
-        self._moving = _velocities(moved / self._steps[:, None], self._steps, MOST_M_S3)
+        self._moved = np.diff(t, axis=0)
+        self._moving = _velocities(self._moved / self._steps[:, None], self._steps, MOST_M_S3)
 
     def at(self, seconds: Array) -> tuple[Array, Array]:
         """R_map_vehicle (m, 3, 3) and t_map_vehicle (m, 3) at times (m,) within the poses' span."""

@@ -107,25 +107,19 @@ def heading_disagreement(
     if duration_s < MIN_DRIVING_S:
         return None
     measured = _measured_at(motion, at[fast], begin)
-    map_turn, source = _turn_against_fixes(smoothed), _source(smoothed)
-    sigma, driving = _heading_sigma(smoothed), ""
-    if abs(map_turn) > MAP_TURN_RAD and source == "imu":
-        # Where fixes were dropped for it, the smoothed path may go anywhere.
-        turn, spread = _turn_of_orientations(smoothed, motion)
-        if abs(turn) > MAP_TURN_RAD:
-            map_turn, sigma = turn, spread
-            driving = "" if motion.twist is not None else " of a vehicle that drives forward"
+    source = _source(smoothed)
+    map_turn, map_sigma, assumed = _turn_of_map(smoothed, motion, source)
     if abs(map_turn) > MAP_TURN_RAD:
         return HeadingDisagreement(
             yaw_rad=map_turn,
-            sigma_rad=math.hypot(sigma, FLOOR_RAD),
+            sigma_rad=math.hypot(map_sigma, FLOOR_RAD),
             axle_m=math.nan,
             duration_s=duration_s,
             measured=measured is not None,
             source=source,
             warning=(
                 f"{motion.name}: heading is turned by {math.degrees(map_turn):+.0f} degrees "
-                f"against the path of the GNSS fixes{driving}, which hardly count therefore. "
+                f"against the path of the GNSS fixes{assumed}, which hardly count therefore. "
                 f"{_MAP_REMEDIES[source]}"
             ),
         )
@@ -170,6 +164,22 @@ def _source(smoothed: SmoothedTrajectory) -> HeadingSource:
     if data.orientation:
         return "imu"
     return "none" if data.headings is None and data.baselines is None else "antennas"
+
+
+def _turn_of_map(
+    smoothed: SmoothedTrajectory, motion: MotionData, source: HeadingSource
+) -> tuple[float, float, str]:
+    """Angle (rad) of the heading against the path of the fixes, 1 sigma, and what is assumed.
+
+    Where fixes were dropped for it, the smoothed path may go anywhere: orientations tell it.
+    """
+    turn = _turn_against_fixes(smoothed)
+    if abs(turn) > MAP_TURN_RAD and source == "imu":
+        told, sigma = _turn_of_orientations(smoothed, motion)
+        if abs(told) > MAP_TURN_RAD:
+            assumed = "" if motion.twist is not None else " of a vehicle that drives forward"
+            return told, sigma, assumed
+    return turn, _heading_sigma(smoothed), ""
 
 
 def _turn_against_fixes(smoothed: SmoothedTrajectory) -> float:
@@ -260,9 +270,8 @@ def turn_of_orientations(
         return 0.0, 0.0
     moved, went = moved[told], (went + turned)[told]
     turn = _turn_between(moved, went, axis_only=False)
-    c, s = math.cos(turn), math.sin(turn)
-    along = moved @ np.array([[c, s], [-s, c]])  # turned as well: what is left is the spread
-    left = np.arctan2(along[:, 0] * went[:, 1] - along[:, 1] * went[:, 0], (along * went).sum(1))
+    of_piece = np.arctan2(went[:, 1], went[:, 0]) - np.arctan2(moved[:, 1], moved[:, 0])
+    left = np.remainder(of_piece - turn + math.pi, math.tau) - math.pi
     lengths_ns = np.diff(pieces_ns[told], axis=1)
     spacing_ns = np.diff(pieces_ns[told, 0], append=pieces_ns[told][-1:, 0])
     covered = np.minimum(spacing_ns, lengths_ns[:, 0]).sum() / np.median(lengths_ns)

@@ -25,15 +25,12 @@ def turns_between(R_a: Array, R_b: Array) -> Array:
     return np.asarray(apart.magnitude())
 
 
-def curve(seconds: Array) -> PoseCurve:
-    return PoseCurve(seconds, *circle(seconds))
-
-
 # A chord cuts a T^2 / 8: 2.5 and 10 mm.
 @pytest.mark.parametrize(("period_s", "most_m"), [(0.1, 2e-5), (0.2, 2e-4)])
 def test_a_circle_is_not_cut(period_s: float, most_m: float) -> None:
     at = np.linspace(0.0, 6.0, 991)
-    R, t = curve(np.arange(0.0, 6.0 + period_s, period_s)).at(at)
+    seconds = np.arange(0.0, 6.0 + period_s, period_s)
+    R, t = PoseCurve(seconds, *circle(seconds)).at(at)
     R_true, t_true = circle(at)
     inside = (at > period_s) & (at < 6.0 - period_s)
     assert np.abs(t - t_true)[inside].max() < most_m
@@ -65,9 +62,7 @@ def test_unequal_pieces_of_one_acceleration_and_angular_acceleration_are_exact()
     assert turns_between(R, R_true).max() < 1e-9
 
 
-def test_velocities_are_continuous_where_pieces_meet_also_of_rotations_about_changing_axes() -> (
-    None
-):
+def test_velocities_are_continuous_at_poses_whatever_the_axes_of_the_turns() -> None:
     seconds = np.linspace(0.0, 2.0, 11)
     turn = np.stack([0.2 * np.sin(2 * seconds), 0.3 * np.cos(seconds), 0.9 * seconds], axis=1)
     place = np.stack([np.sin(seconds), np.cos(2 * seconds), seconds], axis=1)

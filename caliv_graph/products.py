@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal, Protocol
 
 import gtsam
@@ -356,6 +357,10 @@ class GroundObservation:
         by_extrinsic: (3, 3) derivative of (a, b, distance) by the extrinsic's rotation w,
             `R_vehicle_lidar Exp(w)`; None likewise. At 2 m/s, a pitch that is 3 degrees off lets
             the ground rise by a centimetre during a sweep.
+        beyond: (3,) of (a, b, distance), what a bend of the ground may have moved them by: a part
+            of `cov`.
+        beyond_variances: (3,) of `beyond`, by the noise of the points.
+        beyond_by_extrinsic: (3, 3) its derivative by w; None likewise.
         apart_ns: time of the scan after `stamp_ns`. The trajectory carries the observation there;
             it does not contain the heave of the body on its springs.
         by_range_bias: (3, 3) change of (a, b, distance) if all ranges are too long by a metre, and
@@ -382,6 +387,9 @@ class GroundObservation:
     points: int
     R_vehicle_lidar: Array | None = None
     by_extrinsic: Array | None = None
+    beyond: Array = field(default_factory=partial(np.zeros, 3))
+    beyond_variances: Array = field(default_factory=partial(np.zeros, 3))
+    beyond_by_extrinsic: Array | None = None
     apart_ns: int = 0
     by_range_bias: Array | None = None
     by_rates: Array | None = None

@@ -1,4 +1,4 @@
-"""The waves of the ground in its planes, which scans of one place share."""
+"""The waves and bends of the ground in its planes, which scans of one place share."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.targets.ground.planes import RADII_M
 from caliv_graph.trajectory.select import VehicleTrajectory
@@ -26,7 +27,8 @@ def with_floors(
     Waves stay where they are: n scans of one place know the plane's deviation once. Each counts
     as 1 / n of an independent one (`GroundObservation.repeated`), which leaves the information of
     all together right and needs no correlation between factors. How far single scans scatter,
-    which tells outliers and heave, is as before.
+    which tells outliers and heave, is as before. A bend stays as well (`bends_of_ground`), less
+    what of it was the guess with which the scans were compensated.
 
     Args:
         observations: with the floors `before`, every scan for itself.
@@ -45,14 +47,31 @@ def with_floors(
         R, t = trajectories[drive].poses_at([o.stamp_ns for o in own])
         centres = np.array([T.transformFrom(o.centre_lidar) for o in own])
         to_map = np.swapaxes(R @ T.rotation().matrix(), 1, 2)
-        sharing = sharing_scans(
-            np.array([o.axes_lidar for o in own]) @ to_map,
-            t + np.einsum("nij,nj->ni", R, centres),
+        centres = t + np.einsum("nij,nj->ni", R, centres)
+        bends = np.array([_bend_at(o, T.rotation()) for o in own])
+        # Those of the scans jump by a right angle where the ground is nearly level.
+        axes = tangent_axes(_mean_direction([o.normal_lidar for o in own]))
+        turned = np.array([o.axes_lidar for o in own]) @ axes.T
+        of_ground = bends_of_ground(
+            bends, np.array([o.beyond_variances for o in own]), turned, centres
         )
-        for n, o, shares in zip(of, own, sharing, strict=True):
-            cov = o.cov + np.diag(after**2 - before**2)
-            out[n] = replace(o, cov=cov, repeated=(shares - 1.0) * after**2)
+        repeated = (sharing_scans(axes @ to_map, centres) - 1.0) * (after**2 + of_ground)
+        for n, o, bend, more in zip(of, own, bends, repeated, strict=True):
+            bent = np.outer(bend, bend) - np.outer(o.beyond, o.beyond)
+            out[n] = replace(
+                o,
+                cov=o.cov + np.diag(after**2 - before**2) + bent,
+                beyond=bend,
+                beyond_by_extrinsic=None,
+                repeated=more,
+            )
     return tuple(out)
+
+
+def _mean_direction(directions: Sequence[Array]) -> Array:
+    """(3,) unit vector, the mean of some that are a few degrees apart."""
+    mean = np.mean(directions, axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
 
 
 def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
@@ -70,6 +89,41 @@ def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
     along = 0.5 * np.einsum("nki,mki->nm", axes_map, axes_map, optimize=True)
     tilts = np.maximum((overlap * along).sum(axis=1), 1.0)
     return np.column_stack([tilts, tilts, overlap.sum(axis=1)])
+
+
+def _bend_at(observation: GroundObservation, R_vehicle_lidar: gtsam.Rot3) -> Array:
+    """(3,) of (a, b, distance): `beyond` if the scan is compensated with another rotation.
+
+    With a guess that is 3 degrees off, level ground is bent by 0.3 mrad at 3 m/s, in every scan.
+    """
+    o = observation
+    if o.R_vehicle_lidar is None or o.beyond_by_extrinsic is None:
+        return o.beyond
+    w = gtsam.Rot3.Logmap(gtsam.Rot3(o.R_vehicle_lidar).between(R_vehicle_lidar))
+    return np.asarray(o.beyond + o.beyond_by_extrinsic @ w)
+
+
+def bends_of_ground(bends: Array, variances: Array, turned: Array, centres_map: Array) -> Array:
+    """(N, 3) variances of (a, b, distance) by what bends the ground, at the place of each scan.
+
+    What the curvature of a patch does to its plane is of the ground, or of the noise of the scan,
+    which is new in each. Of a single scan it is small by chance as well: this is the mean square
+    over those that share its disc, less the noise.
+
+    Args:
+        bends: (N, 3) of (a, b, distance), rad and metres.
+        variances: (N, 3) of these, by noise.
+        turned: (N, 2, 2) from axes that are the same in all scans to a and b.
+        centres_map: (N, 3) of the discs, metres.
+    """
+    squares = turned**2
+    tilts = np.einsum("nki,nk->ni", turned, bends[:, :2]) ** 2
+    tilts -= np.einsum("nki,nk->ni", squares, variances[:, :2])
+    own = np.column_stack([tilts, bends[:, 2] ** 2 - variances[:, 2]])
+    overlap = _overlap(centres_map)
+    means = np.maximum(overlap @ own / overlap.sum(axis=1)[:, None], 0.0)
+    means[:, :2] = np.einsum("nki,ni->nk", squares, means[:, :2])
+    return np.asarray(means)
 
 
 def sharing_places(centres_map: Array, weights: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 import gtsam
@@ -9,7 +10,12 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration import estimate
-from caliv_graph.calibration.ground_floors import disc_overlap, sharing_scans, with_floors
+from caliv_graph.calibration.ground_floors import (
+    bends_of_ground,
+    disc_overlap,
+    sharing_scans,
+    with_floors,
+)
 from caliv_graph.calibration.sensor_noise import SensorNoise
 from caliv_graph.calibration.structure_evidence import StructureEvidence
 from caliv_graph.common.progress import SilentProgress
@@ -100,6 +106,72 @@ def test_other_floors_in_observations() -> None:
     # Twice from one place; once by another LiDAR; once 300 m away.
     for o, shares in zip(changed, (1.0, 1.0, 0.0, 0.0), strict=True):
         assert o.repeated == pytest.approx(shares * after**2)
+
+
+def test_axes_of_level_ground_jump_and_the_ground_does_not() -> None:
+    """A hair decides which of two axes is the first."""
+    floors = np.array([1e-3, 1e-3, 3e-3])
+    bend = np.array([3e-3, -1e-3, 1e-2])
+    level = [replace(o, beyond=bend) for o in seen_from(*[("front", 0)] * 5)]
+    level[2] = replace(
+        level[2], axes_lidar=level[2].axes_lidar[::-1] * [[1.0], [-1.0]], beyond=bend[[1, 0, 2]]
+    )
+
+    found = with_floors(
+        level, [cast("VehicleTrajectory", Driving())], {"front": gtsam.Pose3()}, floors, floors
+    )
+
+    for o in found:
+        assert o.cov == pytest.approx(level[0].cov)
+        assert o.repeated == pytest.approx(4.0 * (floors**2 + o.beyond**2))
+
+
+def test_what_bends_the_ground_is_the_mean_of_its_place_less_noise() -> None:
+    rng = np.random.default_rng(5)
+    alike, here = np.tile(np.eye(2), (400, 1, 1)), np.zeros((400, 3))
+    noise, ground = rng.normal(0.0, 1e-3, (400, 3)), rng.normal(0.0, 4e-3, (400, 3))
+    variances = np.full((400, 3), 1e-6)
+
+    # The mean square of 400 is known to 7 percent.
+    assert bends_of_ground(noise, variances, alike, here).max() < 0.2e-6
+    both = bends_of_ground(noise + ground, variances, alike, here)
+    assert both == pytest.approx(np.full((400, 3), 16e-6), rel=0.25)
+
+    # A bend elsewhere is no evidence here.
+    apart = here.copy()
+    apart[200:, 0] = 3.0 * DIAMETER_M
+    noise[200:] += ground[200:]
+    found = bends_of_ground(noise, variances, alike, apart)
+    assert found[:200].max() < 0.3e-6
+    assert found[200:] == pytest.approx(np.full((200, 3), 16e-6), rel=0.25)
+
+
+def test_a_bend_of_the_guess_is_not_of_the_ground() -> None:
+    """What a scan was compensated with bends level ground; a better extrinsic takes that away."""
+    floors = np.array([1e-3, 1e-3, 3e-3])
+    guess, found = gtsam.Rot3.RzRyRx(0.02, -0.03, 0.01), gtsam.Rot3.RzRyRx(0.01, 0.0, 0.0)
+    w = gtsam.Rot3.Logmap(guess.between(found))
+    by_extrinsic = np.array([[0.0, 0.01, 0.0], [0.02, 0.0, 0.0], [0.0, 0.03, 0.0]])
+    seen = [
+        replace(
+            o,
+            R_vehicle_lidar=guess.matrix(),
+            beyond=-by_extrinsic @ w,
+            beyond_by_extrinsic=by_extrinsic,
+            cov=o.cov + np.outer(by_extrinsic @ w, by_extrinsic @ w),
+        )
+        for o in seen_from(("front", 0), ("front", 0))
+    ]
+    place = {"front": gtsam.Pose3(found, np.zeros(3))}
+    driving = [cast("VehicleTrajectory", Driving())]
+
+    changed = with_floors(seen, driving, place, floors, floors)
+    again = with_floors(changed, driving, place, floors, floors)
+
+    for o in (*changed, *again):
+        assert o.beyond == pytest.approx(0.0, abs=1e-12)
+        assert o.cov == pytest.approx(seen_from(("front", 0))[0].cov)
+        assert o.repeated == pytest.approx(floors**2)
 
 
 def test_scans_of_one_place_share_waves_without_a_target_too(

@@ -131,8 +131,9 @@ class GroundMeter:
         if times_s.any():
             moved += [(of_rotated - points) / EXTRINSIC_STEP_RAD for of_rotated in by_guess]
             moved += by_rates(points, times_s, guess)
-        changes = response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
-        by_extrinsic = changes[:, biases : biases + 3] if times_s.any() else None
+        changes, bends = response(plane, points, np.stack(moved, axis=2), self._sigma_range_m)
+        turns = slice(biases, biases + 3)
+        by_extrinsic = changes[:, turns] if times_s.any() else None
         return GroundObservation(
             lidar=scan.lidar,
             drive=self._drive,
@@ -145,6 +146,9 @@ class GroundMeter:
             points=plane.points,
             R_vehicle_lidar=None if by_extrinsic is None else guess.rotation().matrix(),
             by_extrinsic=by_extrinsic,
+            beyond=plane.beyond,
+            beyond_variances=plane.beyond_variances,
+            beyond_by_extrinsic=bends[:, turns] if times_s.any() else None,
             apart_ns=scan.stamp_ns - at_ns,
             by_range_bias=changes[:, :biases],
             by_rates=changes[:, biases + 3 :] if times_s.any() else None,

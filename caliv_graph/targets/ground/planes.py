@@ -111,6 +111,7 @@ class GroundPlane:
             the LiDAR: with a patch ahead of it, tilt and distance are correlated.
         beyond: (3,) change of (a, b, distance) if the ground continues to the LiDAR's foot with the
             curvature of the patch.
+        beyond_variances: (3,) of `beyond`, by the noise of the points.
         centre_lidar: (3,) metres, centre of the patch on the plane; there, height and tilt are
             uncorrelated.
         points: number of points on it.
@@ -123,6 +124,7 @@ class GroundPlane:
     axes_lidar: Array
     cov: Array
     beyond: Array
+    beyond_variances: Array
     centre_lidar: Array
     points: int
     scatter_m: float
@@ -308,7 +310,7 @@ def _judged(
     height, sigma_m, part = fit.height[on_plane], fit.sigma_m[on_plane], ratio[on_plane]
     weight = (1.0 - part) ** 2 / sigma_m**2
     centre = np.average(fit.place[on_plane], axis=0, weights=weight)
-    bend_m, beyond = _bend(J[:, :2], height, weight)
+    bend_m, beyond, beyond_variances = _bend(J[:, :2], height, weight)
     if bend_m > MAX_BEND_M:
         return None, BENT
     # Huber's sandwich covariance of an M-estimate: from the scatter, not from the assumed noise.
@@ -330,6 +332,7 @@ def _judged(
         axes_lidar=axes,
         cov=cov,
         beyond=beyond,
+        beyond_variances=beyond_variances,
         centre_lidar=centre @ axes - distance_m * normal,
         points=count,
         scatter_m=float(np.sqrt(np.average(height**2, weights=weight))),
@@ -371,30 +374,48 @@ def is_passed(plane: GroundPlane, points: Array) -> bool:
     return len(passed) > MAX_PASSED * len(ground)
 
 
-def _bend(place: Array, height: Array, weight: Array) -> tuple[float, Array]:
+def _bend(place: Array, height: Array, weight: Array) -> tuple[float, Array, Array]:
     """The best paraboloid through heights (n,) at places (n, 2), relative to their best plane.
 
     Root mean square of the difference, metres; and (3,) change of (a, b, distance) at the LiDAR's
-    foot.
+    foot, with its variances (3,).
+    """
+    curved, at_foot = _bending(place, weight)
+    weighted = np.sqrt(weight) * height
+    inverse = np.linalg.pinv(curved)
+    bends = inverse @ weighted
+    bent = curved @ bends
+    # From the scatter about the paraboloid, as the plane's covariance.
+    left = (at_foot @ inverse) * (weighted - bent)
+    return float(np.sqrt(bent @ bent / weight.sum())), at_foot @ bends, (left**2).sum(axis=1)
+
+
+def _bending(place: Array, weight: Array) -> tuple[Array, Array]:
+    """Three bends at places (n, 2), each less its best plane.
+
+    (n, 3) times the roots of the weights; and (3, 3) what they do to (a, b, distance) at the foot.
     """
     centre = np.average(place, axis=0, weights=weight)
     scale = np.abs(place - centre).max()
     x, y = ((place - centre) / scale).T
     root = np.sqrt(weight)[:, None]
     flat, curved = np.column_stack([np.ones(len(x)), x, y]), np.column_stack([x * x, x * y, y * y])
-    coefficients, *_ = np.linalg.lstsq(root * np.hstack([flat, curved]), root[:, 0] * height)
-    basis, _ = np.linalg.qr(root * flat)
-    bent = (root * curved) @ coefficients[3:]
-    bent -= basis @ (basis.T @ bent)
-    _, p, q, xx, xy, yy = coefficients
+    basis, triangle = np.linalg.qr(root * flat)
+    along = basis.T @ (root * curved)
+    planes = -np.linalg.solve(triangle, along)
     u, v = -centre / scale
-    there = coefficients @ np.array([1.0, u, v, u * u, u * v, v * v])
-    slope = np.array([p + 2.0 * xx * u + xy * v, q + xy * u + 2.0 * yy * v]) / scale
-    return float(np.sqrt(bent @ bent / weight.sum())), -np.append(slope, there)
+    at_foot = np.array([[2.0 * u, v, 0.0], [0.0, u, 2.0 * v], [u * u, u * v, v * v]])
+    at_foot += np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, u, v]]) @ planes
+    return root * curved - basis @ along, -at_foot / np.array([[scale], [scale], [1.0]])
 
 
-def response(plane: GroundPlane, points: Array, moved: Array, sigma_range_m: float) -> Array:
-    """(3, k) changes of a plane's (a, b, distance) with k small motions (N, 3, k) of its points."""
+def response(
+    plane: GroundPlane, points: Array, moved: Array, sigma_range_m: float
+) -> tuple[Array, Array]:
+    """Changes of a plane with k small motions (N, 3, k) of its points.
+
+    (3, k) of its (a, b, distance), and (3, k) of its `beyond`.
+    """
     beams = points / np.linalg.norm(points, axis=1)[:, None]
     both = (plane.normal_lidar, plane.distance_m)
     fit = _against(points, beams, both, plane.axes_lidar, plane.radius_m, sigma_range_m)
@@ -405,4 +426,6 @@ def response(plane: GroundPlane, points: Array, moved: Array, sigma_range_m: flo
     J = np.column_stack([fit.place, np.ones(len(points))])[on_plane]
     rises = np.einsum("i,nik->nk", plane.normal_lidar, moved[on_plane])
     weighted = J * weight[:, None]
-    return np.asarray(-np.linalg.solve(weighted.T @ J, weighted.T @ rises))
+    curved, at_foot = _bending(J[:, :2], weight)
+    bends, *_ = np.linalg.lstsq(curved, np.sqrt(weight)[:, None] * rises)
+    return np.asarray(-np.linalg.solve(weighted.T @ J, weighted.T @ rises)), at_foot @ bends

@@ -145,10 +145,16 @@ def test_meter_tells_what_another_mounting_would_have_made_of_it() -> None:
     assert abs(off[2]) > 4e-4
     assert np.abs(corrected[:2]).max() < 4e-5
     assert abs(corrected[2]) < 2e-4
+    # The ground is level: that it seems bent is of the guess.
+    assert found.beyond_by_extrinsic is not None
+    straight = found.beyond + found.beyond_by_extrinsic @ w
+    assert abs(found.beyond[0]) > 3e-4
+    assert np.abs(straight).max() < 4e-5
     # Clouds of one instant have nothing to be corrected.
     at_once = GroundMeter(config, trajectory, 0).measure(replace(scan, point_times_s=None))
     assert at_once is not None
     assert at_once.by_extrinsic is None
+    assert at_once.beyond_by_extrinsic is None
 
 
 def turning(twist: Array) -> GivenTrajectory:

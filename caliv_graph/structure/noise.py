@@ -207,21 +207,22 @@ def fitted_noise(
     one = len(np.unique(views.of_scan)) <= layout.lidars
     view = views.of_scan[sightings.scan] * layout.strips + sightings.strip
     again = _shared_variance(np.clip(offsets, -limit, limit), view) / free
-    strip = np.maximum(
-        _strip_sigmas(asked, layout, nuisances.strip, errors), ONE_VIEW_M if one else LEAST_M
-    )
     sighting = np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2))
     every = common**2 + shared + float(of_lidar.mean())
     known = of_points + shared + sighting[sightings.strip] ** 2
     own_level = level[sightings.strip]
     lidar_offsets = _lidar_offsets(offsets, known, lidar, own_level, free, layout.lidars)
     if one or not tilts:
+        strip = _strip_sigmas(asked, layout, nuisances.strip, errors, np.ones(layout.strips))
+        strip = np.maximum(strip, ONE_VIEW_M if one else LEAST_M)
         per_m = first_tilts_per_m(level)
         sizes = sighting * per_m, strip * per_m, nuisances.tilt_times
     else:
         sizes = fitted_tilts(
             sightings, geometry, lidar, weights, level, sighting, nuisances, layout.lidars
         )
+        of_tilts = _of_medians(sizes[1], level)
+        strip = _strip_sigmas(asked, layout, nuisances.strip, errors, of_tilts)
     own_tilt, strip_tilt, tilt_times = sizes
     return replace(
         nuisances,
@@ -490,16 +491,31 @@ def _common_size(cov: Array, error: Array, sigma: Array, prior: SizePrior) -> fl
     return math.sqrt(float(weights @ prior.sigmas**2))
 
 
-def _strip_sigmas(asked: _Asked, layout: Layout, before: Array, errors: Array) -> Array:
+def _of_medians(sigmas: Array, level: BoolArray) -> Array:
+    """(K,) sigmas of strips in the median of their kind, level ones or others."""
+    out = np.array(sigmas)
+    for of in (level, ~level):
+        if of.any():
+            out[of] /= np.median(out[of])
+    return out
+
+
+def _strip_sigmas(
+    asked: _Asked, layout: Layout, before: Array, errors: Array, of_tilts: Array
+) -> Array:
     """(K,) 1 sigma of how far LiDARs see each strip apart: a fixed-point step of its likelihood.
 
     The offsets have a t distribution (EM: each strip has a variance of its own about the common
-    one): strips with a reveal in them are seen centimetres apart, others a millimetre.
+    one): strips with a reveal in them are seen centimetres apart, others a millimetre. And a strip
+    whose tilts differ more than those of others, `of_tilts` (K,) times, has offsets that do: one
+    LiDAR has the bonnet below a windscreen in its patches, and what its z has of it.
     """
     own = slice(layout.strip_error, layout.size)
     known = np.clip(_known(asked, own, before), 0.0, 1.0).sum(axis=0)
     square = (errors[own].reshape(layout.lidars, -1) ** 2).sum(axis=0)
-    return heavy_tailed(known, square, before, STRIP_USUAL_M, (LEAST_M, MOST_STRIP_M))
+    limits = LEAST_M, MOST_STRIP_M
+    usual = heavy_tailed(known, square / of_tilts**2, before / of_tilts, STRIP_USUAL_M, limits)
+    return np.clip(of_tilts * usual, *limits)
 
 
 def _bend_sigmas(

@@ -14,7 +14,15 @@ from caliv_graph.structure.beams import (
     parts_of,
     usual_sigmas,
 )
-from caliv_graph.structure.noise import _lidar_offsets, beam_sigmas, range_sigmas
+from caliv_graph.structure.layout import Layout
+from caliv_graph.structure.noise import (
+    PROBES,
+    _Asked,
+    _lidar_offsets,
+    _strip_sigmas,
+    beam_sigmas,
+    range_sigmas,
+)
 from caliv_graph.structure.patches import DrivePatches
 
 POINTS = 20
@@ -117,3 +125,39 @@ def test_the_lidar_whose_offsets_scatter_by_more_has_an_error_of_its_own() -> No
     assert found[1, 0] < 8e-4
     assert found[:2].min(axis=0).max() == 0.0  # what both have is the strips' own
     assert (found[2:] == 0.0).all()  # ten sightings tell nothing, none even less
+
+
+STRIPS, OF_STRIPS_M = 200, 2e-3
+
+
+def strips_seen_apart(before: Array) -> tuple[_Asked, Layout, Array]:
+    """Two LiDARs and the offsets that they see strips apart; of the last one nothing tells."""
+    layout = Layout(poses=0, parameters=0, offsets=(), lidars=2, surface_of=(0,) * STRIPS)
+    errors = np.zeros(layout.size)
+    own = slice(layout.strip_error, layout.size)
+    errors[own] = OF_STRIPS_M * np.random.default_rng(3).standard_normal(2 * STRIPS)
+    told = np.tile(np.arange(STRIPS) < STRIPS - 1, 2)
+    errors[own] *= told
+    signs = np.ones((2 * STRIPS, PROBES))
+    left = np.where(told, 0.0, np.tile(before, 2) ** 2)[:, None]
+    of_signs = {layout.strip_error: (signs, left * signs)}
+    return _Asked(np.zeros((0, PROBES)), np.zeros((0, 0)), of_signs), layout, errors
+
+
+def test_a_strip_that_two_lidars_see_tilted_apart_they_see_apart() -> None:
+    """Where its offset is all that tells a LiDAR's height, no residual shows that it is wrong."""
+    before, of_tilts = np.full(STRIPS, OF_STRIPS_M), np.ones(STRIPS)
+    asked, layout, errors = strips_seen_apart(before)
+
+    alike = _strip_sigmas(asked, layout, before, errors, of_tilts)
+    assert np.median(alike[:-1]) == pytest.approx(OF_STRIPS_M, rel=0.15)
+    assert alike[-1] == pytest.approx(OF_STRIPS_M, rel=0.15)
+
+    of_tilts[[0, -1]] = 5.0
+    before[[0, -1]] *= 5.0
+    asked, layout, errors = strips_seen_apart(before)
+    tilted = _strip_sigmas(asked, layout, before, errors, of_tilts)
+    assert tilted[1:-1] == pytest.approx(alike[1:-1], rel=0.02)
+    assert tilted[-1] == pytest.approx(5.0 * alike[-1], rel=0.02)
+    # What its offsets say counts as well.
+    assert alike[0] < tilted[0] < 5.0 * alike[0]

@@ -357,10 +357,11 @@ class GroundObservation:
         by_extrinsic: (3, 3) derivative of (a, b, distance) by the extrinsic's rotation w,
             `R_vehicle_lidar Exp(w)`; None likewise. At 2 m/s, a pitch that is 3 degrees off lets
             the ground rise by a centimetre during a sweep.
-        beyond: (3,) of (a, b, distance), what a bend of the ground may have moved them by: a part
-            of `cov`.
+        beyond: (3,) change of (a, b, distance) if the ground goes on to the LiDAR's foot with the
+            curvature of the patch, compensated with `R_vehicle_lidar`.
         beyond_variances: (3,) of `beyond`, by the noise of the points.
-        beyond_by_extrinsic: (3, 3) its derivative by w; None likewise.
+        beyond_by_extrinsic: (3, 3) derivative of `beyond` by w; None: no compensation was needed.
+        by_bend: (3, 3) the part of `cov` that is what a bend of the ground may do.
         apart_ns: time of the scan after `stamp_ns`. The trajectory carries the observation there;
             it does not contain the heave of the body on its springs.
         by_range_bias: (3, 3) change of (a, b, distance) if all ranges are too long by a metre, and
@@ -371,7 +372,7 @@ class GroundObservation:
         twist_map: (6,) rad/s and m/s that moved them, map axes; None likewise.
         R_map_vehicle: (3, 3) of the pose at `stamp_ns` by which it was turned; None likewise.
         repeated: (3,) variances of (a, b, distance) beside `cov` with which it counts for the part
-            of what it shares with other scans; None: it shares nothing.
+            of waves and bends that it shares with other scans; None: it shares nothing.
         bent: part of the scans of its drive in which the ground is bent, of the LiDAR that finds it
             so most often.
     """
@@ -390,6 +391,7 @@ class GroundObservation:
     beyond: Array = field(default_factory=partial(np.zeros, 3))
     beyond_variances: Array = field(default_factory=partial(np.zeros, 3))
     beyond_by_extrinsic: Array | None = None
+    by_bend: Array = field(default_factory=partial(np.zeros, (3, 3)))
     apart_ns: int = 0
     by_range_bias: Array | None = None
     by_rates: Array | None = None

@@ -74,17 +74,29 @@ def _chain(
 def compensated(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:
     """(3,) tilts along its axes and distance of an observation compensated with an extrinsic."""
     said = np.array([0.0, 0.0, observation.distance_m])
-    if observation.R_vehicle_lidar is None or observation.by_extrinsic is None:
+    turn = turn_from_guess(observation, R_vehicle_lidar)
+    if turn is None or observation.by_extrinsic is None:
         return said
-    turn = gtsam.Rot3(observation.R_vehicle_lidar.T @ R_vehicle_lidar)
-    return np.asarray(said + observation.by_extrinsic @ gtsam.Rot3.Logmap(turn))
+    return np.asarray(said + observation.by_extrinsic @ turn)
+
+
+def turn_from_guess(observation: GroundObservation, R_vehicle_lidar: Array) -> Array | None:
+    """(3,) right perturbation from the rotation that an observation is compensated with, rad.
+
+    None: it needed no compensation.
+    """
+    if observation.R_vehicle_lidar is None:
+        return None
+    return np.asarray(
+        gtsam.Rot3.Logmap(gtsam.Rot3(observation.R_vehicle_lidar.T @ R_vehicle_lidar))
+    )
 
 
 def compensated_by_turn(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:
     """(3, 3) derivative of `compensated` by a right perturbation of the rotation."""
-    if observation.R_vehicle_lidar is None or observation.by_extrinsic is None:
+    turn = turn_from_guess(observation, R_vehicle_lidar)
+    if turn is None or observation.by_extrinsic is None:
         return np.zeros((3, 3))
-    turn = gtsam.Rot3.Logmap(gtsam.Rot3(observation.R_vehicle_lidar.T @ R_vehicle_lidar))
     return np.asarray(observation.by_extrinsic @ gtsam.Rot3.LogmapDerivative(turn))
 
 
@@ -92,7 +104,7 @@ def held(observation: GroundObservation, R_vehicle_lidar: Array) -> GroundObserv
     """An observation as its motion is compensated with an extrinsic, whatever a solve makes of it.
 
     Where clouds are put together with that extrinsic as well, both turn alike, and neither says
-    anything about it.
+    anything about it. What bends the ground stays: `ground_floors.with_floors` comes before.
     """
     change = compensated(observation, R_vehicle_lidar)
     change[2] -= observation.distance_m

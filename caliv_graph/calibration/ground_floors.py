@@ -8,11 +8,16 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+from scipy.spatial.distance import cdist
 
+from caliv_graph.calibration.ground_factors import turn_from_guess
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, GroundObservation
-from caliv_graph.targets.ground.planes import RADII_M
+from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD, RADII_M
 from caliv_graph.trajectory.select import VehicleTrajectory
+
+USUAL_FLOORS = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
+"""Bends of (a, b, distance) that are worth telling from noise: as large as waves usually are."""
 
 
 def with_floors(
@@ -48,7 +53,7 @@ def with_floors(
         centres = np.array([T.transformFrom(o.centre_lidar) for o in own])
         to_map = np.swapaxes(R @ T.rotation().matrix(), 1, 2)
         centres = t + np.einsum("nij,nj->ni", R, centres)
-        bends = np.array([_bend_at(o, T.rotation()) for o in own])
+        bends = np.array([_bend_at(o, T.rotation().matrix()) for o in own])
         # Those of the scans jump by a right angle where the ground is nearly level.
         axes = tangent_axes(_mean_direction([o.normal_lidar for o in own]))
         turned = np.array([o.axes_lidar for o in own]) @ axes.T
@@ -56,15 +61,11 @@ def with_floors(
             bends, np.array([o.beyond_variances for o in own]), turned, centres
         )
         repeated = (sharing_scans(axes @ to_map, centres) - 1.0) * (after**2 + of_ground)
-        for n, o, bend, more in zip(of, own, bends, repeated, strict=True):
-            bent = np.outer(bend, bend) - np.outer(o.beyond, o.beyond)
-            out[n] = replace(
-                o,
-                cov=o.cov + np.diag(after**2 - before**2) + bent,
-                beyond=bend,
-                beyond_by_extrinsic=None,
-                repeated=more,
-            )
+        for n, o, bend, usual, more in zip(of, own, bends, of_ground, repeated, strict=True):
+            # What a scan has by chance says little of what the ground does to its plane.
+            by_bend = np.outer(bend, bend) + np.diag(np.maximum(usual - bend**2, 0.0))
+            cov = o.cov + np.diag(after**2 - before**2) + by_bend - o.by_bend
+            out[n] = replace(o, cov=cov, by_bend=by_bend, repeated=more)
     return tuple(out)
 
 
@@ -91,37 +92,40 @@ def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
     return np.column_stack([tilts, tilts, overlap.sum(axis=1)])
 
 
-def _bend_at(observation: GroundObservation, R_vehicle_lidar: gtsam.Rot3) -> Array:
+def _bend_at(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:
     """(3,) of (a, b, distance): `beyond` if the scan is compensated with another rotation.
 
     With a guess that is 3 degrees off, level ground is bent by 0.3 mrad at 3 m/s, in every scan.
     """
-    o = observation
-    if o.R_vehicle_lidar is None or o.beyond_by_extrinsic is None:
-        return o.beyond
-    w = gtsam.Rot3.Logmap(gtsam.Rot3(o.R_vehicle_lidar).between(R_vehicle_lidar))
-    return np.asarray(o.beyond + o.beyond_by_extrinsic @ w)
+    turn = turn_from_guess(observation, R_vehicle_lidar)
+    if turn is None or observation.beyond_by_extrinsic is None:
+        return observation.beyond
+    return np.asarray(observation.beyond + observation.beyond_by_extrinsic @ turn)
 
 
 def bends_of_ground(bends: Array, variances: Array, turned: Array, centres_map: Array) -> Array:
     """(N, 3) variances of (a, b, distance) by what bends the ground, at the place of each scan.
 
     What the curvature of a patch does to its plane is of the ground, or of the noise of the scan,
-    which is new in each. Of a single scan it is small by chance as well: this is the mean square
-    over those that share its disc, less the noise.
+    which is new in each. The bend of a single scan may be small by chance. So this is the mean
+    square of the scans that share its disc, less the noise, weighted by how well each tells it.
 
     Args:
         bends: (N, 3) of (a, b, distance), rad and metres.
         variances: (N, 3) of these, by noise.
-        turned: (N, 2, 2) from axes that are the same in all scans to a and b.
+        turned: (N, 2, 2) from axes that are the same in all scans to a and b. They are turned by
+            multiples of a right angle: covariances of a and b are left out.
         centres_map: (N, 3) of the discs, metres.
     """
     squares = turned**2
-    tilts = np.einsum("nki,nk->ni", turned, bends[:, :2]) ** 2
-    tilts -= np.einsum("nki,nk->ni", squares, variances[:, :2])
-    own = np.column_stack([tilts, bends[:, 2] ** 2 - variances[:, 2]])
+    noise = variances.copy()
+    noise[:, :2] = np.einsum("nki,nk->ni", squares, variances[:, :2])
+    told = bends**2
+    told[:, :2] = np.einsum("nki,nk->ni", turned, bends[:, :2]) ** 2
+    told -= noise
+    weights = (noise + USUAL_FLOORS**2) ** -2.0
     overlap = _overlap(centres_map)
-    means = np.maximum(overlap @ own / overlap.sum(axis=1)[:, None], 0.0)
+    means = np.maximum((overlap @ (weights * told)) / (overlap @ weights), 0.0)
     means[:, :2] = np.einsum("nki,ni->nk", squares, means[:, :2])
     return np.asarray(means)
 
@@ -133,8 +137,7 @@ def sharing_places(centres_map: Array, weights: Array) -> Array:
 
 def _overlap(centres_map: Array) -> Array:
     """(N, N) parts of their area that discs share."""
-    apart = np.linalg.norm(centres_map[:, None] - centres_map[None], axis=2)
-    return disc_overlap(apart / (2.0 * RADII_M[-1]))
+    return disc_overlap(cdist(centres_map, centres_map) / (2.0 * RADII_M[-1]))
 
 
 def disc_overlap(x: Array) -> Array:

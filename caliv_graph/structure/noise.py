@@ -20,7 +20,7 @@ from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
 from caliv_graph.structure.sightings import Sightings
-from caliv_graph.structure.tilts import first_tilts_per_m, fitted_tilts
+from caliv_graph.structure.tilts import USUAL_RAD, first_tilts_per_m, fitted_tilts
 from caliv_graph.structure.views import Views
 
 FIRST_SIGHTING_M = 0.01
@@ -221,7 +221,7 @@ def fitted_noise(
         sizes = fitted_tilts(
             sightings, geometry, lidar, weights, level, sighting, nuisances, layout.lidars
         )
-        of_tilts = _of_medians(sizes[1], level)
+        of_tilts = _of_usual(sizes[1], level)
         strip = _strip_sigmas(asked, layout, nuisances.strip, errors, of_tilts)
     own_tilt, strip_tilt, tilt_times = sizes
     return replace(
@@ -491,13 +491,16 @@ def _common_size(cov: Array, error: Array, sigma: Array, prior: SizePrior) -> fl
     return math.sqrt(float(weights @ prior.sigmas**2))
 
 
-def _of_medians(sigmas: Array, level: BoolArray) -> Array:
-    """(K,) sigmas of strips in the median of their kind, level ones or others."""
-    out = np.array(sigmas)
+def _of_usual(strip_tilt: Array, level: BoolArray) -> Array:
+    """(K,) ratios of the sigmas of tilts to the median of their kind, level strips or others.
+
+    At least 1: a step between two parallel faces has an offset and no tilt. `USUAL_RAD` counts as
+    one more strip of each kind.
+    """
+    out = np.array(strip_tilt)
     for of in (level, ~level):
-        if of.any():
-            out[of] /= np.median(out[of])
-    return out
+        out[of] /= np.median(np.append(out[of], USUAL_RAD))
+    return np.maximum(out, 1.0)
 
 
 def _strip_sigmas(
@@ -506,9 +509,10 @@ def _strip_sigmas(
     """(K,) 1 sigma of how far LiDARs see each strip apart: a fixed-point step of its likelihood.
 
     The offsets have a t distribution (EM: each strip has a variance of its own about the common
-    one): strips with a reveal in them are seen centimetres apart, others a millimetre. And a strip
-    whose tilts differ more than those of others, `of_tilts` (K,) times, has offsets that do: one
-    LiDAR has the bonnet below a windscreen in its patches, and what its z has of it.
+    one): strips with a reveal in them are seen centimetres apart, others a millimetre. Where one
+    LiDAR has a piece of another face in its patches, they are tilted and shifted. So the common
+    sigma is multiplied by `of_tilts` (K,), how much more the tilts of a strip differ between LiDARs
+    than usual: its offset may be all that tells a coordinate, and no residual then.
     """
     own = slice(layout.strip_error, layout.size)
     known = np.clip(_known(asked, own, before), 0.0, 1.0).sum(axis=0)

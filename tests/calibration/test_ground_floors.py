@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -108,22 +109,52 @@ def test_other_floors_in_observations() -> None:
         assert o.repeated == pytest.approx(shares * after**2)
 
 
+def bent_by(bend: Array, o: GroundObservation, axes_lidar: Array) -> GroundObservation:
+    """An observation whose patch bends, as it is measured."""
+    by_bend = np.outer(bend, bend)
+    return replace(o, beyond=bend, by_bend=by_bend, cov=o.cov + by_bend, axes_lidar=axes_lidar)
+
+
 def test_axes_of_level_ground_jump_and_the_ground_does_not() -> None:
-    """A hair decides which of two axes is the first."""
-    floors = np.array([1e-3, 1e-3, 3e-3])
-    bend = np.array([3e-3, -1e-3, 1e-2])
-    level = [replace(o, beyond=bend) for o in seen_from(*[("front", 0)] * 5)]
-    level[2] = replace(
-        level[2], axes_lidar=level[2].axes_lidar[::-1] * [[1.0], [-1.0]], beyond=bend[[1, 0, 2]]
-    )
+    """Which axis is the first depends on a normal that is level to a hair."""
+    floors, level = np.array([1e-3, 1e-3, 3e-3]), np.eye(2, 3)
+    jumped = level[::-1] * np.array([[1.0], [-1.0]])
+    seen = [
+        bent_by(np.array([3e-3, -1e-3, 1e-2]), o, level) for o in seen_from(*[("front", 0)] * 5)
+    ]
+    seen[2] = bent_by(np.array([-1e-3, -3e-3, 1e-2]), seen_from(("front", 0))[0], jumped)
+    driving = [cast("VehicleTrajectory", Driving())]
 
-    found = with_floors(
-        level, [cast("VehicleTrajectory", Driving())], {"front": gtsam.Pose3()}, floors, floors
-    )
+    found = with_floors(seen, driving, {"front": gtsam.Pose3()}, floors, floors)
 
+    for before, after in zip(seen, found, strict=True):
+        assert after.cov == pytest.approx(before.cov)
+        assert after.repeated == pytest.approx(4.0 * (floors**2 + before.beyond**2))
+
+
+def test_a_scan_that_seems_flat_where_others_are_bent_counts_as_they_do() -> None:
+    floors, bend = np.array([1e-3, 1e-3, 3e-3]), np.array([3e-3, -1e-3, 1e-2])
+    seen = [bent_by(bend, o, np.eye(2, 3)) for o in seen_from(*[("front", 0)] * 5)]
+    seen[2] = bent_by(np.zeros(3), seen_from(("front", 0))[0], np.eye(2, 3))
+    noisy = [replace(o, beyond_variances=0.1 * bend**2) for o in seen]
+    driving, place = [cast("VehicleTrajectory", Driving())], {"front": gtsam.Pose3()}
+
+    found = with_floors(noisy, driving, place, floors, floors)
+
+    usual = (0.8 - 0.1) * bend**2
     for o in found:
-        assert o.cov == pytest.approx(level[0].cov)
-        assert o.repeated == pytest.approx(4.0 * (floors**2 + o.beyond**2))
+        assert o.repeated == pytest.approx(4.0 * (floors**2 + usual))
+    assert found[2].cov == pytest.approx(seen_from(("front", 0))[0].cov + np.diag(usual))
+    assert found[0].cov == pytest.approx(seen[0].cov)
+    # How often it counts is at most the number of scans (`ground_scatter`).
+    for o in found:
+        assert o.repeated is not None
+        squares = o.repeated * (floors**2 + np.diag(o.by_bend))
+        assert (squares < 4.001 * np.diag(o.cov) ** 2).all()
+    again = with_floors(found, driving, place, floors, floors)
+    for one, other in zip(found, again, strict=True):
+        assert one.cov == pytest.approx(other.cov)
+        assert one.repeated == pytest.approx(other.repeated)
 
 
 def test_what_bends_the_ground_is_the_mean_of_its_place_less_noise() -> None:
@@ -137,41 +168,52 @@ def test_what_bends_the_ground_is_the_mean_of_its_place_less_noise() -> None:
     both = bends_of_ground(noise + ground, variances, alike, here)
     assert both == pytest.approx(np.full((400, 3), 16e-6), rel=0.25)
 
-    # A bend elsewhere is no evidence here.
+    # A bend elsewhere is no evidence here, nor is a scan that hardly tells its own.
     apart = here.copy()
     apart[200:, 0] = 3.0 * DIAMETER_M
     noise[200:] += ground[200:]
+    noise[0], variances[0] = 0.5, 0.3**2
+    noise[399], variances[399] = 1e-2, 0.3**2
     found = bends_of_ground(noise, variances, alike, apart)
     assert found[:200].max() < 0.3e-6
     assert found[200:] == pytest.approx(np.full((200, 3), 16e-6), rel=0.25)
 
 
+def test_bends_along_axes_of_each_scan() -> None:
+    """Up along x of the LiDAR alone, in scans whose axes are turned by a right angle either way."""
+    turned = np.array([np.eye(2), [[0.0, 1.0], [-1.0, 0.0]], [[0.0, -1.0], [1.0, 0.0]]])
+    along = np.column_stack([turned @ np.array([3e-3, 0.0]), np.zeros(3)])
+    none, here = np.full((3, 3), 1e-10), np.zeros((3, 3))
+
+    found = bends_of_ground(along, none, turned, here)
+
+    assert found == pytest.approx(along**2, abs=1e-9)
+
+
 def test_a_bend_of_the_guess_is_not_of_the_ground() -> None:
     """What a scan was compensated with bends level ground; a better extrinsic takes that away."""
     floors = np.array([1e-3, 1e-3, 3e-3])
-    guess, found = gtsam.Rot3.RzRyRx(0.02, -0.03, 0.01), gtsam.Rot3.RzRyRx(0.01, 0.0, 0.0)
-    w = gtsam.Rot3.Logmap(guess.between(found))
+    guess, true = gtsam.Rot3.RzRyRx(0.02, -0.03, 0.01), gtsam.Rot3.RzRyRx(0.01, 0.0, 0.0)
+    w = gtsam.Rot3.Logmap(guess.between(true))
     by_extrinsic = np.array([[0.0, 0.01, 0.0], [0.02, 0.0, 0.0], [0.0, 0.03, 0.0]])
     seen = [
         replace(
-            o,
+            bent_by(-by_extrinsic @ w, o, np.eye(2, 3)),
             R_vehicle_lidar=guess.matrix(),
-            beyond=-by_extrinsic @ w,
             beyond_by_extrinsic=by_extrinsic,
-            cov=o.cov + np.outer(by_extrinsic @ w, by_extrinsic @ w),
         )
         for o in seen_from(("front", 0), ("front", 0))
     ]
-    place = {"front": gtsam.Pose3(found, np.zeros(3))}
     driving = [cast("VehicleTrajectory", Driving())]
 
-    changed = with_floors(seen, driving, place, floors, floors)
-    again = with_floors(changed, driving, place, floors, floors)
+    def at(of: Sequence[GroundObservation], R: gtsam.Rot3) -> tuple[GroundObservation, ...]:
+        return with_floors(of, driving, {"front": gtsam.Pose3(R, np.zeros(3))}, floors, floors)
 
-    for o in (*changed, *again):
-        assert o.beyond == pytest.approx(0.0, abs=1e-12)
-        assert o.cov == pytest.approx(seen_from(("front", 0))[0].cov)
-        assert o.repeated == pytest.approx(floors**2)
+    # An extrinsic that is far off first, as a rough solve may have it.
+    for found in (at(seen, true), at(at(seen, guess), true), at(at(seen, true), true)):
+        for o in found:
+            assert o.cov == pytest.approx(seen_from(("front", 0))[0].cov)
+            assert o.repeated == pytest.approx(floors**2)
 
 
 def test_scans_of_one_place_share_waves_without_a_target_too(

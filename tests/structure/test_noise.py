@@ -19,6 +19,7 @@ from caliv_graph.structure.noise import (
     PROBES,
     _Asked,
     _lidar_offsets,
+    _of_usual,
     _strip_sigmas,
     beam_sigmas,
     range_sigmas,
@@ -161,3 +162,13 @@ def test_a_strip_that_two_lidars_see_tilted_apart_they_see_apart() -> None:
     assert tilted[-1] == pytest.approx(5.0 * alike[-1], rel=0.02)
     # What its offsets say counts as well.
     assert alike[0] < tilted[0] < 5.0 * alike[0]
+
+
+def test_tilts_of_strips_are_compared_with_those_of_their_kind() -> None:
+    level = np.array([True] * 3 + [False] * 6)
+    ground, walls = [2e-3, 2e-3, 25e-3], [3e-4, 4e-4, 5e-4, 5e-4, 6e-4, 10e-3]
+    found = _of_usual(np.array(ground + walls), level)
+    # The median of ground and 1 mrad is 2 mrad; that of walls and 1 mrad 0.5. None is below 1.
+    assert found == pytest.approx([1.0, 1.0, 12.5, 1.0, 1.0, 1.0, 1.0, 1.2, 20.0])
+    # One strip is compared with what is usual.
+    assert _of_usual(np.array([25e-3]), np.array([True])) == pytest.approx([25.0 / 13.0])

@@ -239,6 +239,12 @@ def test_the_noise_of_sightings_is_estimated(solved: Solved) -> None:
     assert range_sigmas(solved.problem.patches, 0.03) == pytest.approx([0.01, 0.01], rel=0.15)
 
 
+def test_strips_that_lidars_see_tilted_apart_are_seen_apart(solved: Solved) -> None:
+    noise, upright = solved.nuisances, ~solved.strips.level
+    sigmas = np.log([noise.strip_tilt[upright], noise.strip[upright]])
+    assert np.corrcoef(sigmas)[0, 1] > 0.75
+
+
 def test_the_jitter_of_stamps_is_estimated(solved: Solved) -> None:
     """At 24 m/s a millisecond is 24 mm, and 1.2 mm is less than a sighting's own error."""
     assert solved.nuisances.jitter_s < 5e-5

@@ -149,6 +149,7 @@ class GroundMeter:
             beyond=plane.beyond,
             beyond_variances=plane.beyond_variances,
             beyond_by_extrinsic=bends[:, turns] if times_s.any() else None,
+            by_bend=np.outer(plane.beyond, plane.beyond),
             apart_ns=scan.stamp_ns - at_ns,
             by_range_bias=changes[:, :biases],
             by_rates=changes[:, biases + 3 :] if times_s.any() else None,

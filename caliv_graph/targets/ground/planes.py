@@ -382,7 +382,8 @@ def _bend(place: Array, height: Array, weight: Array) -> tuple[float, Array, Arr
     """
     curved, at_foot = _bending(place, weight)
     weighted = np.sqrt(weight) * height
-    inverse = np.linalg.pinv(curved)
+    # One ring is a conic: one of the bends is then another plane, and its part is rounding.
+    inverse = np.linalg.pinv(curved, rcond=np.finfo(np.float64).eps * len(curved))
     bends = inverse @ weighted
     bent = curved @ bends
     # From the scatter about the paraboloid, as the plane's covariance.
@@ -391,9 +392,11 @@ def _bend(place: Array, height: Array, weight: Array) -> tuple[float, Array, Arr
 
 
 def _bending(place: Array, weight: Array) -> tuple[Array, Array]:
-    """Three bends at places (n, 2), each less its best plane.
+    """Heights of three bends, x^2, x y and y^2, at places (n, 2), each less its best plane.
 
-    (n, 3) times the roots of the weights; and (3, 3) what they do to (a, b, distance) at the foot.
+    In units of the largest distance from the centre. Heights (n, 3), metres per unit, times the
+    roots of the weights; and what each does to (a, b, distance) at the LiDAR's foot (3, 3), rad,
+    rad and metres per unit: ground that rises there is nearer, hence with the other sign.
     """
     centre = np.average(place, axis=0, weights=weight)
     scale = np.abs(place - centre).max()
@@ -402,7 +405,7 @@ def _bending(place: Array, weight: Array) -> tuple[Array, Array]:
     flat, curved = np.column_stack([np.ones(len(x)), x, y]), np.column_stack([x * x, x * y, y * y])
     basis, triangle = np.linalg.qr(root * flat)
     along = basis.T @ (root * curved)
-    planes = -np.linalg.solve(triangle, along)
+    planes, *_ = np.linalg.lstsq(triangle, -along)
     u, v = -centre / scale
     at_foot = np.array([[2.0 * u, v, 0.0], [0.0, u, 2.0 * v], [u * u, u * v, v * v]])
     at_foot += np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, u, v]]) @ planes
@@ -412,9 +415,9 @@ def _bending(place: Array, weight: Array) -> tuple[Array, Array]:
 def response(
     plane: GroundPlane, points: Array, moved: Array, sigma_range_m: float
 ) -> tuple[Array, Array]:
-    """Changes of a plane with k small motions (N, 3, k) of its points.
+    """Changes of a plane with k small motions (N, 3, k) of its points, lidar frame, metres.
 
-    (3, k) of its (a, b, distance), and (3, k) of its `beyond`.
+    (3, k) of its (a, b, distance), and (3, k) of its `beyond`; rad, rad, metres.
     """
     beams = points / np.linalg.norm(points, axis=1)[:, None]
     both = (plane.normal_lidar, plane.distance_m)

@@ -27,6 +27,7 @@ from tests.samples import pose
 from tests.scan_rates import scanned_every
 from tests.targets.ground.scans import (
     HEIGHT_M,
+    NOSE_DOWN,
     RING,
     UP_LIDAR,
     Depth,
@@ -77,10 +78,11 @@ def test_level_ground_by_hand() -> None:
 def test_noise_along_the_beam_biases_nothing_and_is_what_the_covariance_says(
     sigma_m: float,
 ) -> None:
-    off, squares = [], []
+    off, squares, bends = [], [], []
     for seed in range(150):
         plane = measured(scan_of(level, sigma_m=sigma_m, seed=seed), sigma_m=sigma_m)
         off.append(errors(plane))
+        bends.append(plane.beyond**2 / plane.beyond_variances)
         squares.append(off[-1] @ np.linalg.solve(plane.cov, off[-1]))
     bias, spread = np.mean(off, axis=0), np.std(off, axis=0)
     assert np.abs(bias[:2]).max() < 2e-5 * sigma_m / 0.01
@@ -88,6 +90,21 @@ def test_noise_along_the_beam_biases_nothing_and_is_what_the_covariance_says(
     assert spread == pytest.approx(np.sqrt(np.diag(plane.cov)), rel=0.35)
     # 450 degrees of freedom: 392 to 511 in 95 of 100 cases.
     assert 370.0 < sum(squares) < 540.0
+    # What the noise makes of the bend of level ground: 150 squares are known to 12 percent.
+    assert np.mean(bends, axis=0) == pytest.approx(np.ones(3), abs=0.36)
+
+
+@pytest.mark.parametrize("half_deg", [180.0, 60.0])
+def test_one_ring_tells_no_bend_across_it(half_deg: float) -> None:
+    """It is a conic: one of the three bends is the same as a tilt, to the last digit."""
+    azimuth = np.radians(np.linspace(-half_deg, half_deg, 1200))
+    down = math.radians(15.0)
+    along = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) * math.cos(down)
+    ring = np.column_stack([along, np.full(len(azimuth), -math.sin(down))])
+    plane = measured(scan_of(level, sigma_m=0.01, directions=ring @ NOSE_DOWN.matrix()))
+    assert np.abs(plane.beyond).max() < 0.2
+    assert (plane.beyond_variances < 0.2**2).all()
+    assert np.linalg.eigvalsh(plane.cov_with(ground_floors(NoiseConfig())))[0] > 0.0
 
 
 def test_the_covariance_is_that_of_the_distance_at_the_lidar() -> None:

@@ -371,8 +371,8 @@ class GroundObservation:
         taken_s: first and last time of the points after `stamp_ns`, seconds.
         twist_map: (6,) rad/s and m/s that moved them, map axes; None likewise.
         R_map_vehicle: (3, 3) of the pose at `stamp_ns` by which it was turned; None likewise.
-        repeated: (3,) variances of (a, b, distance) beside `cov` with which it counts for the part
-            of waves and bends that it shares with other scans; None: it shares nothing.
+        repeated: (3, 3) of (a, b, distance), beside `cov`, with which it counts for the part of
+            waves and bends that it shares with other scans; None: it shares nothing.
         bent: part of the scans of its drive in which the ground is bent, of the LiDAR that finds it
             so most often.
     """

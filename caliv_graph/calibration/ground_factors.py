@@ -208,7 +208,7 @@ def ground_plane_factor(
 
     cov = with_heave(observation, heave_m)
     if observation.repeated is not None:
-        cov += np.diag(observation.repeated)
+        cov += observation.repeated
     noise = gtsam.noiseModel.Gaussian.Covariance(cov / weight)
     return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
 

@@ -60,12 +60,11 @@ def with_floors(
         of_ground = bends_of_ground(
             bends, np.array([o.beyond_variances for o in own]), turned, centres
         )
-        repeated = (sharing_scans(axes @ to_map, centres) - 1.0) * (after**2 + of_ground)
-        for n, o, bend, usual, more in zip(of, own, bends, of_ground, repeated, strict=True):
-            # What a scan has by chance says little of what the ground does to its plane.
-            by_bend = np.outer(bend, bend) + np.diag(np.maximum(usual - bend**2, 0.0))
+        more = np.sqrt(sharing_scans(axes @ to_map, centres) - 1.0)
+        for n, o, by_bend, root in zip(of, own, of_ground, more, strict=True):
             cov = o.cov + np.diag(after**2 - before**2) + by_bend - o.by_bend
-            out[n] = replace(o, cov=cov, by_bend=by_bend, repeated=more)
+            repeated = root[:, None] * (np.diag(after**2) + by_bend) * root
+            out[n] = replace(o, cov=cov, by_bend=by_bend, repeated=repeated)
     return tuple(out)
 
 
@@ -104,30 +103,34 @@ def _bend_at(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:
 
 
 def bends_of_ground(bends: Array, variances: Array, turned: Array, centres_map: Array) -> Array:
-    """(N, 3) variances of (a, b, distance) by what bends the ground, at the place of each scan.
+    """(N, 3, 3) of (a, b, distance), what bends the ground at the place of each scan may do.
 
     What the curvature of a patch does to its plane is of the ground, or of the noise of the scan,
     which is new in each. The bend of a single scan may be small by chance. So this is the mean
-    square of the scans that share its disc, less the noise, weighted by how well each tells it.
+    square of the scans that share its disc, less the noise, weighted by how well each tells it. One
+    bend tilts a plane and shifts it: both are correlated as in the scans.
 
     Args:
         bends: (N, 3) of (a, b, distance), rad and metres.
         variances: (N, 3) of these, by noise.
-        turned: (N, 2, 2) from axes that are the same in all scans to a and b. They are turned by
-            multiples of a right angle: covariances of a and b are left out.
+        turned: (N, 2, 2) from axes that are the same in all scans to a and b.
         centres_map: (N, 3) of the discs, metres.
     """
-    squares = turned**2
-    noise = variances.copy()
-    noise[:, :2] = np.einsum("nki,nk->ni", squares, variances[:, :2])
-    told = bends**2
-    told[:, :2] = np.einsum("nki,nk->ni", turned, bends[:, :2]) ** 2
-    told -= noise
+    to_own = np.tile(np.eye(3), (len(bends), 1, 1))
+    to_own[:, :2, :2] = turned
+    alike = np.einsum("nki,nk->ni", to_own, bends)
+    noise = np.einsum("nki,nk->ni", to_own**2, variances)
     weights = (noise + USUAL_FLOORS**2) ** -2.0
     overlap = _overlap(centres_map)
-    means = np.maximum((overlap @ (weights * told)) / (overlap @ weights), 0.0)
-    means[:, :2] = np.einsum("nki,ni->nk", squares, means[:, :2])
-    return np.asarray(means)
+    total = overlap @ weights
+    weighted = np.sqrt(weights) * alike
+    squares = np.einsum("na,nb->nab", weighted, weighted).reshape(-1, 9)
+    means = (overlap @ squares).reshape(-1, 3, 3)
+    of_all = np.einsum("naa->na", means) / total
+    left = np.maximum(of_all - overlap @ (weights * noise) / total, 0.0)
+    # Of the mean squares a part: a factor on each coordinate keeps them positive definite.
+    parts = np.sqrt(left / (np.maximum(of_all, np.finfo(np.float64).tiny) * total))
+    return np.asarray(to_own @ (parts[:, :, None] * means * parts[:, None]) @ to_own.swapaxes(1, 2))
 
 
 def sharing_places(centres_map: Array, weights: Array) -> Array:

@@ -166,7 +166,8 @@ def _of_planes(
         variances[row] = np.diag(o.cov)
         variances[row, 2] += weights.heave_m[n] ** 2
         if o.repeated is not None:
-            repeated[row] = o.repeated * (problem.floors**2 + np.diag(o.by_bend))
+            shared = problem.floors**2 + np.diag(o.by_bend)
+            repeated[row] = np.diag(o.repeated) * shared
     fitted = len(lidars) + len(centres)
     tilts, distances = (
         _Scatter(residuals[:, k], variances[:, k], repeated[:, k], n * fitted)

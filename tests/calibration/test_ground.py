@@ -899,7 +899,7 @@ def test_scans_of_one_place_know_the_waves_of_the_ground_as_one_does(scans: int)
     floors = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
     one = replace(one, cov=np.diag(floors**2))
     alike = [
-        replace(one, stamp_ns=stamp_ns, repeated=(scans - 1.0) * floors**2)
+        replace(one, stamp_ns=stamp_ns, repeated=np.diag((scans - 1.0) * floors**2))
         for _, stamp_ns in still.problem.poses
     ]
 

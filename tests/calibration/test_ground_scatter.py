@@ -183,7 +183,7 @@ def test_scans_of_one_place_are_no_more_than_one() -> None:
         rng = np.random.default_rng(seed)
         waves = NORMAL_RAD * np.append(rng.normal(size=(3, 2)), np.zeros((3, 1)), axis=1)
         planes = observed(case.problem, case.truth, PLANE, partial(by_place, waves))
-        alike = [replace(o, repeated=9.0 * floors) for o in planes]
+        alike = [replace(o, repeated=np.diag(9.0 * floors)) for o in planes]
         weights, values = full_weights(case.problem, alike), with_planes(case.truth, PLANE)
         levels = larger_levels(case.problem, alike, weights, values, NO_HEIGHT)
         found += levels.normal_rad > NORMAL_RAD

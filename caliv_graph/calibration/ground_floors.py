@@ -54,7 +54,7 @@ def with_floors(
         to_map = np.swapaxes(R @ T.rotation().matrix(), 1, 2)
         centres = t + np.einsum("nij,nj->ni", R, centres)
         bends = np.array([_bend_at(o, T.rotation().matrix()) for o in own])
-        # Those of the scans jump by a right angle where the ground is nearly level.
+        # The axes of scans jump by a right angle where the ground is level in the LiDAR's frame.
         axes = tangent_axes(_mean_direction([o.normal_lidar for o in own]))
         turned = np.array([o.axes_lidar for o in own]) @ axes.T
         of_ground = bends_of_ground(
@@ -75,7 +75,7 @@ def _mean_direction(directions: Sequence[Array]) -> Array:
 
 
 def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
-    """(N, 3) how many scans of a LiDAR share the deviation (a, b, distance) of each, itself too.
+    """(N, 3) how many scans of a LiDAR share the deviation (a, b, distance) of each, 1 at least.
 
     The plane is fitted to a disc; waves shorter than it are averaged there, and two planes share
     what their discs share. A tilt stays in the map, while a and b turn with the LiDAR.
@@ -87,8 +87,8 @@ def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
     overlap = _overlap(centres_map)
     # Half the trace of axes_i axes_j^T: the cosine of how far the LiDAR turned between them.
     along = 0.5 * np.einsum("nki,mki->nm", axes_map, axes_map, optimize=True)
-    tilts = np.maximum((overlap * along).sum(axis=1), 1.0)
-    return np.column_stack([tilts, tilts, overlap.sum(axis=1)])
+    tilts, distances = (overlap * along).sum(axis=1), overlap.sum(axis=1)
+    return np.maximum(np.column_stack([tilts, tilts, distances]), 1.0)
 
 
 def _bend_at(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:

@@ -339,7 +339,7 @@ def _observation(
             seen_ns[name] = tuple(sorted(c.stamp_ns for c in of_lidar))
             kept += order.thinned(of_lidar, most)
         elif not tally.scans:
-            warnings.append(f"{label}: lidar '{name}' has no scans in this drive")
+            warnings.append(f"{label}: {_out_of_view(name, config, order)}")
         else:
             warnings.append(
                 f"{label}: lidar '{name}' sees it in {tally.kept} scans, needs "
@@ -347,17 +347,31 @@ def _observation(
                 f"{tally.reasons()}. {tally.remedy(config.extraction, config.target is not None)}"
             )
     if not kept:
-        warnings = [_why_none(label, config, extractor.tallies)]
+        warnings = [_why_none(label, config, extractor.tallies, order)]
     centre = extractor.centre_map
     return TargetObservation(0, label, centre, tuple(kept), tuple(warnings), seen_ns)
 
 
-def _why_none(region: str, config: Config, tallies: dict[str, Tally]) -> str:
+def _out_of_view(name: str, config: Config, order: ScanOrder) -> str:
+    """Why no scan of a LiDAR was looked at."""
+    scans = len(order.of_stamps[name])
+    if not scans:
+        return f"lidar '{name}' has no scans in this drive"
+    return (
+        f"lidar '{name}' has it in view in none of its {scans} scans: it is outside the field of "
+        f"view, or too far for {config.extraction.min_points} points (extraction.min_points)"
+    )
+
+
+def _why_none(region: str, config: Config, tallies: dict[str, Tally], order: ScanOrder) -> str:
     """Why no LiDAR saw the target, in one line."""
     parts = []
     is_given = config.target is not None
     best = max(tallies.values(), key=lambda tally: (tally.kept, len(tally.sparse)))
     for name, tally in tallies.items():
+        if not tally.scans:
+            parts.append(_out_of_view(name, config, order))
+            continue
         near = (
             f"nearest return {tally.nearest_m:.2f} m from the region"
             if 0.0 < tally.nearest_m < math.inf

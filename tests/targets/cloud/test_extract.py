@@ -155,7 +155,8 @@ class Scans:
 
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         for stamp, points in enumerate(self.clouds[lidar]):
-            yield LidarScan(lidar, stamp, points, f"{lidar}/{stamp}.pcd")
+            if wanted is None or stamp in wanted:
+                yield LidarScan(lidar, stamp, points, f"{lidar}/{stamp}.pcd")
 
     def motion(self) -> MotionData:
         raise AssertionError("poses come with the trajectory")
@@ -720,6 +721,23 @@ def test_of_many_scans_some_are_kept_and_all_are_told() -> None:
 
     assert len(observation.clouds) <= 10
     assert observation.seen_ns == {"front": tuple(range(20))}
+
+
+def test_a_lidar_that_never_looks_there_is_not_without_scans() -> None:
+    """Of more than a few scans, those that cannot have the region in view are not decoded."""
+    scene = chair_at_10()
+    config = config_of(tight_region(scene.world), lidars=BOTH)
+    ahead = np.abs(np.arctan2(scene.points_lidar[:, 1], scene.points_lidar[:, 0])) < 0.3
+    scans = {"front": [scene.points_lidar] * 8, "rear": [scene.points_lidar[ahead]] * 200}
+
+    (observation,) = extracted_from(scans, config)
+
+    (warning,) = observation.warnings
+    assert warning.startswith("target: lidar 'rear' has it in view in none of its 200 scans")
+
+    above = config_of(TargetRegion(min=(9, -5, 4), max=(12, -2, 6)), lidars=BOTH)
+    with pytest.raises(TargetError, match="'rear' has it in view in none of its 200 scans"):
+        extracted_from(scans, above)
 
 
 def test_a_region_that_nothing_enters_says_how_near_it_came() -> None:

@@ -88,7 +88,7 @@ def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
     # Half the trace of axes_i axes_j^T: the cosine of how far the LiDAR turned between them.
     along = 0.5 * np.einsum("nki,mki->nm", axes_map, axes_map, optimize=True)
     tilts, distances = (overlap * along).sum(axis=1), overlap.sum(axis=1)
-    return np.maximum(np.column_stack([tilts, tilts, distances]), 1.0)
+    return np.asarray(np.maximum(np.column_stack([tilts, tilts, distances]), 1.0))
 
 
 def _bend_at(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:

@@ -11,13 +11,11 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from caliv_graph.calibration.ground_factors import turn_from_guess
+from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.geometry.se3 import tangent_axes
 from caliv_graph.products import Array, GroundObservation
-from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD, RADII_M
+from caliv_graph.targets.ground.planes import RADII_M, ground_floors
 from caliv_graph.trajectory.select import VehicleTrajectory
-
-USUAL_FLOORS = np.array([NORMAL_FLOOR_RAD, NORMAL_FLOOR_RAD, DISTANCE_FLOOR_M])
-"""Bends of (a, b, distance) that are worth telling from noise: as large as waves usually are."""
 
 
 def with_floors(
@@ -55,12 +53,14 @@ def with_floors(
         centres = t + np.einsum("nij,nj->ni", R, centres)
         bends = np.array([_bend_at(o, T.rotation().matrix()) for o in own])
         # The axes of scans jump by a right angle where the ground is level in the LiDAR's frame.
-        axes = tangent_axes(_mean_direction([o.normal_lidar for o in own]))
+        normal = np.mean([o.normal_lidar for o in own], axis=0)
+        axes = tangent_axes(normal / np.linalg.norm(normal))
         turned = np.array([o.axes_lidar for o in own]) @ axes.T
+        overlap = overlap_of_discs(centres)
         of_ground = bends_of_ground(
-            bends, np.array([o.beyond_variances for o in own]), turned, centres
+            bends, np.array([o.beyond_variances for o in own]), turned, overlap
         )
-        more = np.sqrt(sharing_scans(axes @ to_map, centres) - 1.0)
+        more = np.sqrt(sharing_scans(axes @ to_map, overlap) - 1.0)
         for n, o, by_bend, root in zip(of, own, of_ground, more, strict=True):
             cov = o.cov + np.diag(after**2 - before**2) + by_bend - o.by_bend
             repeated = root[:, None] * (np.diag(after**2) + by_bend) * root
@@ -68,13 +68,7 @@ def with_floors(
     return tuple(out)
 
 
-def _mean_direction(directions: Sequence[Array]) -> Array:
-    """(3,) unit vector, the mean of some that are a few degrees apart."""
-    mean = np.mean(directions, axis=0)
-    return np.asarray(mean / np.linalg.norm(mean))
-
-
-def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
+def sharing_scans(axes_map: Array, overlap: Array) -> Array:
     """(N, 3) how many scans of a LiDAR share the deviation (a, b, distance) of each, 1 at least.
 
     The plane is fitted to a disc; waves shorter than it are averaged there, and two planes share
@@ -82,9 +76,8 @@ def sharing_scans(axes_map: Array, centres_map: Array) -> Array:
 
     Args:
         axes_map: (N, 2, 3) of a and b.
-        centres_map: (N, 3) of the discs, metres.
+        overlap: (N, N) of the discs (`overlap_of_discs`).
     """
-    overlap = _overlap(centres_map)
     # Half the trace of axes_i axes_j^T: the cosine of how far the LiDAR turned between them.
     along = 0.5 * np.einsum("nki,mki->nm", axes_map, axes_map, optimize=True)
     tilts, distances = (overlap * along).sum(axis=1), overlap.sum(axis=1)
@@ -102,7 +95,7 @@ def _bend_at(observation: GroundObservation, R_vehicle_lidar: Array) -> Array:
     return np.asarray(observation.beyond + observation.beyond_by_extrinsic @ turn)
 
 
-def bends_of_ground(bends: Array, variances: Array, turned: Array, centres_map: Array) -> Array:
+def bends_of_ground(bends: Array, variances: Array, turned: Array, overlap: Array) -> Array:
     """(N, 3, 3) of (a, b, distance), what bends the ground at the place of each scan may do.
 
     What the curvature of a patch does to its plane is of the ground, or of the noise of the scan,
@@ -114,14 +107,14 @@ def bends_of_ground(bends: Array, variances: Array, turned: Array, centres_map: 
         bends: (N, 3) of (a, b, distance), rad and metres.
         variances: (N, 3) of these, by noise.
         turned: (N, 2, 2) from axes that are the same in all scans to a and b.
-        centres_map: (N, 3) of the discs, metres.
+        overlap: (N, N) of the discs (`overlap_of_discs`).
     """
     to_own = np.tile(np.eye(3), (len(bends), 1, 1))
     to_own[:, :2, :2] = turned
     alike = np.einsum("nki,nk->ni", to_own, bends)
     noise = np.einsum("nki,nk->ni", to_own**2, variances)
-    weights = (noise + USUAL_FLOORS**2) ** -2.0
-    overlap = _overlap(centres_map)
+    # Bends are worth telling from noise down to the size that waves usually have.
+    weights = (noise + ground_floors(NoiseConfig()) ** 2) ** -2.0
     total = overlap @ weights
     weighted = np.sqrt(weights) * alike
     squares = np.einsum("na,nb->nab", weighted, weighted).reshape(-1, 9)
@@ -135,11 +128,11 @@ def bends_of_ground(bends: Array, variances: Array, turned: Array, centres_map: 
 
 def sharing_places(centres_map: Array, weights: Array) -> Array:
     """(N,) the same of the height at places (N, 3), metres, that count with `weights` (N,)."""
-    return np.maximum(_overlap(centres_map) @ weights, 1.0)
+    return np.maximum(overlap_of_discs(centres_map) @ weights, 1.0)
 
 
-def _overlap(centres_map: Array) -> Array:
-    """(N, N) parts of their area that discs share."""
+def overlap_of_discs(centres_map: Array) -> Array:
+    """(N, N) parts of their area that discs about places (N, 3), metres, share."""
     return disc_overlap(cdist(centres_map, centres_map) / (2.0 * RADII_M[-1]))
 
 

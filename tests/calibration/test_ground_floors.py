@@ -14,6 +14,7 @@ from caliv_graph.calibration import estimate
 from caliv_graph.calibration.ground_floors import (
     bends_of_ground,
     disc_overlap,
+    overlap_of_discs,
     sharing_scans,
     with_floors,
 )
@@ -39,23 +40,27 @@ def axes(*headings_deg: float) -> Array:
 
 
 def test_a_vehicle_that_stands_sees_one_plane() -> None:
-    assert sharing_scans(axes(*[30.0] * 7), np.zeros((7, 3))) == pytest.approx(np.full((7, 3), 7))
+    assert sharing_scans(axes(*[30.0] * 7), overlap_of_discs(np.zeros((7, 3)))) == pytest.approx(
+        np.full((7, 3), 7)
+    )
 
 
 def test_scans_a_disc_apart_share_nothing() -> None:
     places = DIAMETER_M * np.arange(4)[:, None] * np.array([1.0, 0.0, 0.0])
-    assert sharing_scans(axes(*[0.0] * 4), places) == pytest.approx(np.ones((4, 3)))
+    assert sharing_scans(axes(*[0.0] * 4), overlap_of_discs(places)) == pytest.approx(
+        np.ones((4, 3))
+    )
 
 
 def test_a_turn_tells_the_tilt_of_the_ground_from_the_lidar_s_but_no_height() -> None:
     """A right angle on the spot: two tilts that share nothing, one height."""
-    assert sharing_scans(axes(0.0, 90.0), np.zeros((2, 3))) == pytest.approx(
+    assert sharing_scans(axes(0.0, 90.0), overlap_of_discs(np.zeros((2, 3)))) == pytest.approx(
         np.array([[1.0, 1.0, 2.0], [1.0, 1.0, 2.0]])
     )
 
 
 def test_a_full_turn_averages_the_tilt_out() -> None:
-    sharing = sharing_scans(axes(*range(0, 360, 30)), np.zeros((12, 3)))
+    sharing = sharing_scans(axes(*range(0, 360, 30)), overlap_of_discs(np.zeros((12, 3))))
     assert sharing == pytest.approx(np.tile([1.0, 1.0, 12.0], (12, 1)))
 
 
@@ -158,8 +163,8 @@ def test_what_bends_the_ground_is_the_mean_of_its_place_less_noise() -> None:
     variances = np.full((400, 3), 1e-6)
 
     # The mean square of 400 is known to 7 percent.
-    assert np.abs(bends_of_ground(noise, variances, alike, here)).max() < 0.2e-6
-    both = bends_of_ground(noise + ground, variances, alike, here)
+    assert np.abs(bends_of_ground(noise, variances, alike, overlap_of_discs(here))).max() < 0.2e-6
+    both = bends_of_ground(noise + ground, variances, alike, overlap_of_discs(here))
     assert both == pytest.approx(np.tile(16e-6 * np.eye(3), (400, 1, 1)), abs=4e-6)
 
     # A bend elsewhere is no evidence here, nor is a scan that hardly tells its own.
@@ -168,7 +173,7 @@ def test_what_bends_the_ground_is_the_mean_of_its_place_less_noise() -> None:
     noise[200:] += ground[200:]
     noise[0], variances[0] = 0.5, 0.3**2
     noise[399], variances[399] = 1e-2, 0.3**2
-    found = bends_of_ground(noise, variances, alike, apart)
+    found = bends_of_ground(noise, variances, alike, overlap_of_discs(apart))
     assert np.abs(found[:200]).max() < 0.3e-6
     assert found[200:] == pytest.approx(np.tile(16e-6 * np.eye(3), (200, 1, 1)), abs=4e-6)
     assert (np.linalg.eigvalsh(found) > -1e-12).all()
@@ -179,7 +184,7 @@ def test_one_bend_in_axes_of_each_scan() -> None:
     turned = np.array([gtsam.Rot2(a).matrix() for a in (0.0, 0.6, -np.pi / 2.0)])
     seen = np.column_stack([turned @ bend[:2], np.full(3, bend[2])])
 
-    found = bends_of_ground(seen, none, turned, here)
+    found = bends_of_ground(seen, none, turned, overlap_of_discs(here))
 
     assert found == pytest.approx(np.einsum("na,nb->nab", seen, seen), abs=1e-10)
 

@@ -214,12 +214,11 @@ def _add_orientations(
 def _add_velocities(
     graph: TrajectoryGraph, data: SmootherInput, velocities: NodeVelocities
 ) -> None:
-    # Rows along the axes in which they were measured, the forward one first: a root in those of the
-    # IMU would mix it with what odometry does not measure.
+    # The first row is what the forward velocity says, along the axis that it was measured along:
+    # with the root of a covariance it would be as uncertain as what odometry does not measure.
     R_twist_imu = data.T_vehicle_twist.between(data.T_vehicle_imu).rotation().matrix()
-    roots = np.linalg.solve(
-        np.linalg.cholesky(R_twist_imu @ velocities.cov @ R_twist_imu.T), R_twist_imu
-    )
+    information = np.linalg.inv(R_twist_imu @ velocities.cov @ R_twist_imu.T)
+    roots = np.swapaxes(np.linalg.cholesky(information), 1, 2) @ R_twist_imu
     for k, i in enumerate(velocities.nodes.tolist()):
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(roots[k], False)
         factor = velocity_factor(

@@ -17,6 +17,7 @@ from caliv_graph.products import Array, BoolArray, ImuSamples, IntArray, TwistSa
 from caliv_graph.trajectory.gnss import Positions
 from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate, log_so3
 from caliv_graph.trajectory.noise import ImuNoise
+from caliv_graph.trajectory.wheels import UNMEASURED_M_S
 
 SAMPLES_AT_A_TIME = 16_384
 """Of the IMU, whose orientations are carried to their nodes at once: 16 MB."""
@@ -231,8 +232,52 @@ def velocities_at_nodes(
     carried = np.einsum("nij,nj->ni", dR, at_imu) - scale * dv
     cov_node = rotated(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
     late = delay_s[:, None, None] * np.eye(3)
-    nodes, mean, mean_cov = _weighted_mean(node, np.dstack([carried[:, :, None], late]), cov_node)
+    values = np.dstack([carried[:, :, None], late])
+    alone = cov[usable][:, 1, 1] >= UNMEASURED_M_S**2
+    if alone.any():
+        ahead_node = (dR @ R_imu_twist)[alone, :, 0]
+        one = _forward_mean(node[alone], ahead_node, values[alone], cov_node[alone])
+        both = (node[~alone], one[0]), (values[~alone], one[1]), (cov_node[~alone], one[2])
+        node, values, cov_node = map(np.concatenate, both)
+    nodes, mean, mean_cov = _weighted_mean(node, values, cov_node)
     return NodeVelocities(nodes, mean[:, :, 0], mean[:, :, 1:], mean_cov)
+
+
+def _forward_mean(
+    group: IntArray, ahead: Array, values: Array, cov: Array
+) -> tuple[IntArray, Array, Array]:
+    """Groups (g,) of forward velocities; what they measure (g, 3, c); its covariance (g, 3, 3).
+
+    Each measures `ahead . v`. Of a group this is one number along the mean of the axes, and nothing
+    beside it. The axes differ by what the vehicle turns meanwhile: solved for a whole velocity,
+    they give it a lateral part of tens of metres per second, all noise, and what turns with it
+    seems to be measured.
+
+    Args:
+        group: (m,) ascending.
+        ahead: (m, 3) unit vectors along which the velocities are measured.
+        values: (m, 3, c) vectors of which the parts along `ahead` are; the first is the velocity.
+        cov: (m, 3, 3) (m/s)^2 of the first.
+    """
+    starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
+    weight = 1.0 / np.einsum("mi,mij,mj->m", ahead, cov, ahead)
+    along = np.einsum("mi,mic->mc", ahead, values)
+    total = np.add.reduceat(weight, starts)
+
+    def mean(of: Array) -> Array:
+        each = of.reshape(len(of), -1) * weight[:, None]
+        return np.asarray(np.add.reduceat(each, starts) / total[:, None]).reshape(-1, *of.shape[1:])
+
+    axis = mean(ahead)
+    length = np.linalg.norm(axis, axis=1)
+    axis /= length[:, None]
+    on_axis = axis[:, :, None] * axis[:, None, :]
+    beside = np.eye(3) - on_axis
+    forward = mean(along) / length[:, None]
+    measured = axis[:, :, None] * forward[:, None, :] + beside @ mean(values)
+    variance = 1.0 / (total * length**2)
+    mean_cov = variance[:, None, None] * on_axis + UNMEASURED_M_S**2 * beside
+    return group[starts], measured, mean_cov
 
 
 def positions_at_nodes(

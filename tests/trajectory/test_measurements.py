@@ -18,6 +18,7 @@ from caliv_graph.trajectory.measurements import (
 )
 from caliv_graph.trajectory.noise import imu_noise
 from caliv_graph.trajectory.states import States
+from caliv_graph.trajectory.wheels import UNMEASURED_M_S
 from tests.trajectory.motions import START_NS, Sensors, config_for
 
 SAMPLES = 400
@@ -95,3 +96,43 @@ def test_forward_velocities_of_a_pitching_vehicle_agree_with_its_motion(height_m
     states = States(R, none, R[:, :, 0] * speed, none, none)
     residuals = velocity_residuals(states, found.nodes, found.velocity_imu, found.delay_s, 9.8)
     assert np.abs(residuals[:, 0]).max() < 5e-4
+
+
+def test_forward_velocities_along_axes_that_turn_tell_none_to_the_side() -> None:
+    """Noise of 3 cm/s along axes that differ by 10 mrad would be 3 m/s to the side."""
+    rates, speed, offset = np.array([0.1, 0.3, 0.5]), 3.0, np.array([0.2, -1.2, 0.4])
+    at = 10**12 + 2_000_000 * np.arange(1001)
+    seconds = (at - at[0]) * 1e-9
+    turned = np.array([gtsam.Rot3.Expmap(rates * s).matrix() for s in seconds])
+    # Of the IMU: that of the odometry's origin, and what the lever adds.
+    velocity = turned @ (np.array([speed, 0.0, 0.0]) + np.cross(rates, offset))
+    lifted = np.gradient(velocity, seconds, axis=0) + np.array([0.0, 0.0, 9.8])
+    force = np.einsum("nji,nj->ni", turned, lifted)
+    dead = DeadReckoning(at, np.tile(rates, (len(at), 1)), force)
+    nodes = at[0] + 100_000_000 * np.arange(1, 19)
+    noise = 0.03 * np.random.default_rng(1).standard_normal(len(at[25:-25:10]))
+    measured = np.outer(speed + noise, [1.0, 0.0, 0.0])
+    odometry = TwistSamples(at[25:-25:10], measured)
+    lateral = UNMEASURED_M_S**2
+    cov = np.tile(np.diag([0.03**2, lateral, lateral]), (len(noise), 1, 1))
+    samples = ImuSamples(at, dead.gyro, force)
+    T_twist_imu = gtsam.Pose3(gtsam.Rot3(), offset)
+
+    found = velocities_at_nodes(
+        odometry, cov, nodes, dead, imu_noise(samples, config_for(Sensors())), T_twist_imu
+    )
+
+    assert found is not None
+    here = np.searchsorted(at, nodes)
+    none = np.zeros((len(nodes), 3))
+    states = States(turned[here], none, velocity[here], none, none)
+    residuals = velocity_residuals(states, found.nodes, found.velocity_imu, found.delay_s, 9.8)
+    variances, axes = np.linalg.eigh(found.cov)
+    forward = np.einsum("mi,mi->m", axes[:, :, 0] * np.sign(axes[:, :1, 0]), residuals)
+    of_node = nearest_node(nodes, odometry.stamps_ns)
+    mean = np.array([noise[of_node == k].mean() for k in found.nodes])
+    # Of its five messages, but for the ends, where those beyond the nodes are left out.
+    assert forward[1:-1] == pytest.approx(-mean[1:-1], abs=1e-4)
+    assert np.sqrt(variances[1:-1, 0]) == pytest.approx(0.03 / np.sqrt(5.0), rel=0.1)
+    assert np.abs(residuals[:, 1:]).max() < 0.1
+    assert np.sqrt(variances[:, 1:]) == pytest.approx(UNMEASURED_M_S)

@@ -86,13 +86,17 @@ def turned_twist(R_a_b: Array, twist_b: Array) -> Array:
     return np.concatenate([R_a_b @ twist_b[:3], R_a_b @ twist_b[3:]])
 
 
-def twist_by_turn(twists: Array) -> Array:
+def twist_by_turn(twists: Array, pivot: Array | None = None) -> Array:
     """(..., 6, 3) change of twists (..., 6) that are constant in the map, by a turn of their axes.
 
     The derivative of `turned_twist(R^T, ...)` by a right perturbation of R, `ad(twist)` without its
-    last columns.
+    last columns. With a `pivot` (3,) the axes turn about it, and their origin becomes another point
+    of the body, with another velocity; None: about their origin.
     """
-    return np.concatenate([skew(twists[..., :3]), skew(twists[..., 3:])], axis=-2)
+    by_shift = skew(twists[..., 3:])
+    if pivot is not None:
+        by_shift = by_shift + skew(twists[..., :3]) @ skew(pivot)
+    return np.concatenate([skew(twists[..., :3]), by_shift], axis=-2)
 
 
 def rpy(R_a_b: Array) -> Array:

@@ -60,7 +60,9 @@ class PosePrior:
 
     def with_rates(self) -> PosePrior:
         """The same with the errors of the rates (`trajectory.rates`), where the poses tell them."""
-        rows = rate_rows(self.stamps_ns, self.T_map_vehicle)
+        # Residuals turn the axes about that pivot (`residuals._turned`): what it makes of the
+        # velocity of the origin is in them already.
+        rows = rate_rows(self.stamps_ns, self.T_map_vehicle, self.chart.pivot_vehicle)
         if rows is None:
             return self
         information, gradient = with_rates(self.information, self.gradient, rows)

@@ -114,13 +114,6 @@ def _turned(state: State, twists: Array | None) -> Array | None:
     return np.asarray(np.einsum("mji,mkj->mki", R, np.stack([turn, shift], 1)).reshape(-1, 6))
 
 
-def _by_turn_of_axes(twists: Array, pivot_vehicle: Array) -> Array:
-    """(Q, 6, 3) change of twists (Q, 6) by a turn of the axes about a pivot (3,)."""
-    out = twist_by_turn(twists)
-    out[:, 3:] += skew(twists[:, :3]) @ skew(pivot_vehicle)
-    return out
-
-
 def _late_motion(
     state: State, lidar: IntArray, pose: IntArray, twists: Array | None, accelerations: Array | None
 ) -> Array | None:
@@ -219,7 +212,7 @@ def geometry_of(
     if late is not None:
         at_scans = _inverse_adjoints(at_stamps)[own_stamp]
         by_own_pose = np.swapaxes(at_scans, 1, 2) @ by_extrinsic
-        by_own_pose[:, :3] += np.swapaxes(_by_turn_of_axes(late, pivot), 1, 2) @ by_pose
+        by_own_pose[:, :3] += np.swapaxes(twist_by_turn(late, pivot), 1, 2) @ by_pose
     if twists is not None and now is not None and layout.rates:
         apart_s = sightings.time_s[:, None]
         # Points of other times were moved to the stamp with these twists and extrinsics, and are
@@ -228,7 +221,7 @@ def geometry_of(
         before = np.einsum("qij,qj->qi", made_with, twists[pose])
         present = np.einsum("qij,qj->qi", back[lidar], now[pose])
         plain += np.einsum("qc,qci->qi", apart_s * (present - before), by_extrinsic)
-        by_turn = np.swapaxes(_by_turn_of_axes(apart_s * now[pose], pivot), 1, 2) @ by_pose
+        by_turn = np.swapaxes(twist_by_turn(apart_s * now[pose], pivot), 1, 2) @ by_pose
         by_own_pose = np.concatenate([by_own_pose[:, :3] + by_turn, by_own_pose[:, 3:]], axis=1)
         by_extrinsic = by_extrinsic + _by_compensation(sightings.time_s, present, by_extrinsic)
     B = tangent_axes(normal)

@@ -48,7 +48,9 @@ def by_rates(angular_velocity: Array) -> Array:
 
 
 def rate_rows(
-    stamps_ns: Sequence[int] | IntArray, T_map_vehicle: Sequence[gtsam.Pose3]
+    stamps_ns: Sequence[int] | IntArray,
+    T_map_vehicle: Sequence[gtsam.Pose3],
+    pivot_vehicle: Array | None = None,
 ) -> Array | None:
     """(RATES, 6 m) derivatives of the errors of the rates by right perturbations of m poses.
 
@@ -63,6 +65,8 @@ def rate_rows(
     Args:
         stamps_ns: (m,) of the poses, strictly increasing.
         T_map_vehicle: m poses.
+        pivot_vehicle: (3,) metres, about which a turn of a pose is taken out: a turn of the vehicle
+            frame about it is no error of the rates. None: its origin.
 
     Returns:
         None, if no two poses follow each other within `MOST_TURN_RAD`.
@@ -78,7 +82,7 @@ def rate_rows(
         by_later = np.asarray(gtsam.Pose3.LogmapDerivative(step))
         by_poses = np.hstack([-by_later @ step.inverse().AdjointMap(), by_later])
         motion = np.asarray(gtsam.Pose3.Logmap(step))
-        half = 0.5 * twist_by_turn(motion)
+        half = 0.5 * twist_by_turn(motion, pivot_vehicle)
         by_poses[:, :3] -= half
         by_poses[:, 6:9] -= half
         seconds = int(stamps_ns[i + 1] - stamps_ns[i]) / NANOSECONDS_PER_SECOND

@@ -93,6 +93,20 @@ def test_a_turn_of_the_vehicle_frame_leaves_the_rates_in_the_map(way: float) -> 
         assert rows @ common == pytest.approx(np.zeros(RATES), abs=1e-9)
 
 
+def test_a_turn_about_a_pivot_leaves_the_rates_that_are_turned_about_it() -> None:
+    """As structure turns them, about the IMU: its origin moves, which is no shift on the body."""
+    pivot = np.array([1.8, 0.2, 0.3])
+    poses = driven(np.random.default_rng(2))
+    rows = rate_rows(STAMPS, poses, pivot)
+    usual = rate_rows(STAMPS, poses)
+    assert rows is not None
+    assert usual is not None
+    for turn in np.eye(3):
+        common = np.tile([*turn, *np.cross(pivot, turn)], len(poses))
+        assert rows @ common == pytest.approx(np.zeros(RATES), abs=1e-9)
+        assert np.abs(usual @ common)[6:].max() > 0.1
+
+
 def test_a_gyroscope_that_is_off_is_a_rate() -> None:
     """Poses that turn by 1 mrad/s more about y than those of the trajectory, for a second."""
     arc = np.array([0.0, 0.0, 0.2, 2.0, 0.0, 0.0])

@@ -121,7 +121,11 @@ def _rows_of_standing(drive: int, standing: StandingErrors, first: int) -> dict[
 def _gaussian(
     problem: Problem, term: StructureTerm, T_vehicle_ref: gtsam.Pose3, standing: Collection[int]
 ) -> Gaussian:
-    """A term as a Gaussian of the graph's variables, about where the term was linearised."""
+    """A term as a Gaussian of the graph's variables, about where the term was linearised.
+
+    Structure sees the LiDARs, not the vehicle: a turn of its frame shows nothing, wherever the
+    graph has moved the map since (`Gaussian.carried`).
+    """
     point = _linearisation_point(problem, term, T_vehicle_ref)
     own_information, own_gradient = term.information, term.gradient
     errors: dict[int, slice] = {}
@@ -165,7 +169,14 @@ def _gaussian(
     information = 0.5 * (information + information.T)
     gradient = by_graph.T @ (own_gradient - own_information @ held)
     constant = _constant(information, gradient)
-    return Gaussian(tuple(point), tuple(point.values()), information, gradient, constant)
+    return Gaussian(
+        tuple(point),
+        tuple(point.values()),
+        information,
+        gradient,
+        constant,
+        carried=key_extrinsic(),
+    )
 
 
 def _linearisation_point(

@@ -268,7 +268,8 @@ class Gaussian:
 
     Twice its error is `d^T information d - 2 gradient^T d + constant`, where d has `log(T0^-1 T)`
     of poses and rotations (of poses rotation then translation) and differences of vectors. Poses of
-    the vehicle about means without heave are in a `chart` instead.
+    the vehicle about means without heave are in a `chart` instead, and so are those of which a
+    LiDAR on it tells (`carried`).
 
     Attributes:
         keys: its variables.
@@ -277,6 +278,11 @@ class Gaussian:
         gradient: (n,).
         constant: what makes the error positive.
         chart: of its poses, all the vehicle's; None: their logarithms.
+        carried: key of an extrinsic E among `keys`; poses before it are the vehicle's. Those of the
+            LiDAR, X E, are what is known: X has the coordinates
+            `Ad(E0) (log((X0 E0)^-1 X E) - log(E0^-1 E))`, to the first order those of X alone. A
+            turn of the vehicle frame, `X a` and `a^-1 E`, and a motion of the map, `b X`, are
+            straight lines in them at once. None: no such extrinsic.
     """
 
     keys: tuple[int, ...]
@@ -285,6 +291,7 @@ class Gaussian:
     gradient: Array
     constant: float = 0.0
     chart: PoseChart | None = None
+    carried: int | None = None
 
     def factor(self) -> gtsam.LinearContainerFactor:
         """As one native factor; see `at` for what it is away from the means."""
@@ -299,9 +306,20 @@ class Gaussian:
         a pose is turned. Where a direction is open, all poses move together by hundredths of a
         radian, and what is known to hundredths of a milliradian would seem to tell of it.
         """
-        d, blocks = self._apart(values)
-        H = _by_blocks(blocks, _by_blocks(blocks, self.information).T)
-        b = _by_blocks(blocks, (self.gradient - self.information @ d)[:, None])[:, 0]
+        d, blocks, by_extrinsic = self._apart(values)
+        pull = self.gradient - self.information @ d
+        half = _by_blocks(blocks, self.information)
+        H = _by_blocks(blocks, half.T)
+        b = _by_blocks(blocks, pull[:, None])[:, 0]
+        if self.carried is not None:
+            # J has blocks on its diagonal, and below E a column C for the poses.
+            own = self._rows(self.carried)
+            poses = slice(len(by_extrinsic))
+            across = half[:, poses] @ by_extrinsic
+            H[:, own] += across
+            H[own] += across.T
+            H[own, own] += by_extrinsic.T @ self.information[poses, poses] @ by_extrinsic
+            b[own] += by_extrinsic.T @ pull[poses]
         return 0.5 * (H + H.T), b
 
     def chi_square(self, values: gtsam.Values) -> float:
@@ -309,11 +327,20 @@ class Gaussian:
 
         A vehicle that is turned by 50 mrad and shifted by a metre seems to heave by 25 mm there.
         """
-        d, _ = self._apart(values)
+        d, *_ = self._apart(values)
         return float(d @ self.information @ d - 2.0 * self.gradient @ d + self.constant)
 
-    def _apart(self, values: gtsam.Values) -> tuple[Array, list[Array]]:
-        """Coordinates d (n,) from the means; derivatives by right perturbations, in blocks."""
+    def _rows(self, key: int) -> slice:
+        """Where the coordinates of a variable are."""
+        at = self.keys.index(key)
+        first, size = (sum(map(tangent_size, self.means[:end])) for end in (at, at + 1))
+        return slice(first, size)
+
+    def _apart(self, values: gtsam.Values) -> tuple[Array, list[Array], Array]:
+        """Coordinates d (n,) from the means; derivatives by right perturbations, in blocks.
+
+        And those of the first poses by the extrinsic that is `carried`, (6 m, 6); none without.
+        """
         apart, blocks = [], []
         for key, mean in zip(self.keys, self.means, strict=True):
             if isinstance(mean, gtsam.Pose3):
@@ -336,7 +363,30 @@ class Gaussian:
             moved = np.array([apart[k] for k in poses]).reshape(-1, 6)
             for k, block in zip(poses, self.chart.derivatives(moved), strict=True):
                 blocks[k] = block
-        return np.concatenate(apart), blocks
+        by_extrinsic = np.zeros((0, POSE_SIZE))
+        if self.carried is not None:
+            by_extrinsic = self._behind(self.carried, values, apart, blocks)
+        return np.concatenate(apart), blocks, by_extrinsic
+
+    def _behind(
+        self, carried: int, values: gtsam.Values, apart: list[Array], blocks: list[Array]
+    ) -> Array:
+        """Puts the poses before `carried` into its coordinates; (6 m, 6) derivatives by it."""
+        at = self.keys.index(carried)
+        first, E = self.means[at], values.atPose3(carried)
+        assert isinstance(first, gtsam.Pose3)
+        turned, back = np.asarray(first.AdjointMap()), np.asarray(E.inverse().AdjointMap())
+        of_own = turned @ blocks[at]
+        out = []
+        for k, (key, mean) in enumerate(zip(self.keys[:at], self.means[:at], strict=True)):
+            if not isinstance(mean, gtsam.Pose3):
+                break
+            T = mean.compose(first).between(values.atPose3(key).compose(E))
+            by_lidar = turned @ gtsam.Pose3.LogmapDerivative(T)
+            apart[k] = turned @ (gtsam.Pose3.Logmap(T) - apart[at])
+            blocks[k] = by_lidar @ back
+            out.append(by_lidar - of_own)
+        return np.concatenate(out) if out else np.zeros((0, POSE_SIZE))
 
 
 def _by_blocks(blocks: Sequence[Array], rows: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -199,6 +201,82 @@ def test_what_leaves_a_common_turn_open_leaves_it_open_wherever_it_went() -> Non
     np.testing.assert_allclose(b, 0.0, atol=1e-12 * np.abs(H).max())
     by_gtsam = known.factor().linearize(values).information()
     assert np.abs(other_turns.T @ by_gtsam @ other_turns).max() > 0.01 * np.abs(H).max()
+
+
+def test_where_a_lidar_was_tells_no_turn_of_the_vehicle_frame_after_the_map_has_moved() -> None:
+    """Poses of a LiDAR in any map, those of the vehicle behind it: both moves are open at once.
+
+    With logarithms of the vehicle's poses a map moved by centimetres held S2V roll and pitch of a
+    drive of circles where they had been, to 0.5 mrad (random drive 131 of the second simulator).
+    """
+    rng = np.random.default_rng(3)
+    X = [gtsam.Pose3.Expmap(rng.standard_normal(6)) for _ in range(3)]
+    E = gtsam.Pose3.Expmap(rng.standard_normal(6))
+    of_vehicle = E.inverse().AdjointMap()
+    L = [T.compose(E) for T in X]
+    by_lidar = np.hstack([np.kron(np.eye(3), of_vehicle), np.tile(np.eye(6), (3, 1))])
+    # Of its poses in the first one's axes: the map is open.
+    between = [
+        np.hstack([-L[i].between(L[0]).AdjointMap(), *(np.eye(6) * (k == i) for k in (1, 2))])
+        for i in (1, 2)
+    ]
+    J = np.vstack(between) @ by_lidar
+    keys = (10, 11, 12, 13)
+    known = Gaussian(keys, (*X, E), 1e8 * J.T @ J, np.zeros(24), carried=13)
+    turn = gtsam.Pose3.Expmap(np.array([0.03, -0.02, 0.04, 0.1, 0.05, -0.03]))
+    moved = gtsam.Pose3.Expmap(np.array([-0.02, 0.01, 0.3, 2.0, -3.0, 1.0]))
+    values = gtsam.Values()
+    for key, T in zip(keys, X, strict=False):
+        values.insert(key, moved.compose(T).compose(turn))
+    values.insert(13, turn.inverse().compose(E))
+
+    H, _ = known.at(values)
+
+    at = values.atPose3(13).inverse().AdjointMap()
+    turns = np.vstack([np.tile(np.eye(6), (3, 1)), -at])
+    assert np.abs(turns.T @ H @ turns).max() < 1e-12 * np.abs(H).max()
+    assert known.chi_square(values) < 1e-3 * 1e8
+    in_logarithms = replace(known, carried=None).at(values)[0]
+    assert np.abs(turns.T @ in_logarithms @ turns).max() > 1e-3 * np.abs(H).max()
+
+
+def test_what_a_lidar_tells_is_linearised_where_its_variables_are() -> None:
+    rng = np.random.default_rng(4)
+    poses = [gtsam.Pose3.Expmap(rng.standard_normal(6)) for _ in range(4)]
+    middle = rng.standard_normal(2)
+    means: tuple[gtsam.Pose3 | gtsam.Rot3 | Array, ...] = (*poses[:2], middle, *poses[2:])
+    A = rng.standard_normal((26, 26))
+    keys = (10, 11, 12, 13, 14)
+    found = Gaussian(keys, means, A @ A.T, rng.standard_normal(26), 3.0, carried=13)
+
+    def away(d: Array) -> gtsam.Values:
+        out, start = gtsam.Values(), 0
+        for key, mean in zip(keys, means, strict=True):
+            own = d[start : start + tangent_size(mean)]
+            start += len(own)
+            out.insert(key, mean + own if isinstance(mean, np.ndarray) else mean.retract(own))
+        return out
+
+    # At the means it is the quadratic in right perturbations that it was given.
+    H, b = found.at(away(np.zeros(26)))
+    np.testing.assert_allclose(H, found.information, atol=1e-9)
+    np.testing.assert_allclose(b, found.gradient, atol=1e-9)
+    there = away(0.3 * rng.standard_normal(26))
+    H, b = found.at(there)
+
+    def chi_square(d: Array) -> float:
+        out, start = gtsam.Values(), 0
+        for key, mean in zip(keys, means, strict=True):
+            own = d[start : start + tangent_size(mean)]
+            start += len(own)
+            if isinstance(mean, np.ndarray):
+                out.insert(key, there.atVector(key) + own)
+            else:
+                out.insert(key, there.atPose3(key).retract(own))
+        return found.chi_square(out)
+
+    slope = [(chi_square(d) - chi_square(-d)) / 4e-5 for d in 1e-5 * np.eye(26)]
+    np.testing.assert_allclose(-b, slope, rtol=1e-6, atol=1e-6)
 
 
 def test_a_scaled_velocity_has_the_right_jacobians() -> None:

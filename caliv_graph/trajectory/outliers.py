@@ -106,6 +106,16 @@ class LostFixes:
     count: int
     sigmas: float
 
+    def sentence(self, name: str, has_imu: bool) -> str:
+        """What to tell of the drive `name`, whose motion is that of an IMU or of wheels."""
+        with_imu = "that the IMU's yaw counts from east to the left, " if has_imu else ""
+        return (
+            f"{name}: {self.dropped} of {self.count} GNSS fixes disagree with the motion, each by "
+            f"more than {self.sigmas:.1f} sigma: with most of them dropped the vehicle's path is "
+            f"not known. Check that latitude and longitude are in degrees, {with_imu}"
+            f"gnss.lever_arm, and the clocks of GNSS and {'IMU' if has_imu else 'velocities'}"
+        )
+
 
 def lost_fixes(data: SmootherInput, dropped: IntArray) -> LostFixes | None:
     """Whether most fixes of a drive were dropped (`MOST_DROPPED`); None if they were not.

@@ -16,6 +16,7 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray, MotionData, Trajectory
+from caliv_graph.trajectory.build import Estimate
 from caliv_graph.trajectory.correlated import MOVES, CorrelatedError
 from caliv_graph.trajectory.correlated_step import (
     WithErrors,
@@ -30,7 +31,12 @@ from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.noise import configured_errors
-from caliv_graph.trajectory.outliers import dropped_warnings, solve_without_outliers
+from caliv_graph.trajectory.outliers import (
+    Robust,
+    dropped_warnings,
+    lost_fixes,
+    solve_without_outliers,
+)
 from caliv_graph.trajectory.parameters import GYROSCOPE, UncertainParameter
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import (
@@ -95,23 +101,20 @@ def smooth_trajectory(
         del estimate  # its graph
         robust, estimate = solve_without_outliers(data, nodes, found)
         warnings += robust.warnings
-    data, positions = robust.data, robust.data.positions
-    if parameters:
-        kernel = data.config.robust.kernel
-        # Handed over: a second graph beside it would be as large.
-        begun = [estimate]
-        del estimate
-        settled = settle(data, nodes, begun.pop(), robust.dropped, kernel, parameters)
-        if late := with_late_clock(settled):
-            settled = settle(settled.data, nodes, settled.estimate, robust.dropped, kernel, late)
-            # Fixes that the wrong time had put beside the path.
-            robust, estimate = solve_without_outliers(settled.data, nodes, settled.estimate.states)
-            late = settled.parameters
-            settled = settle(robust.data, nodes, estimate, robust.dropped, kernel, late)
-    else:
-        settled = Settled(data, estimate)
-    linear = settled.estimate.graph.factors.linearize(settled.estimate.values)
-    cov_imu, yaw_sigma = covariances_of(linear, settled.data, settled.estimate.states)
+    positions = robust.data.positions
+    # Handed over: a second graph beside it would be as large.
+    begun = [estimate]
+    del estimate
+    try:
+        robust, settled = _settled(robust, nodes, begun, parameters)
+        linear = settled.estimate.graph.factors.linearize(settled.estimate.values)
+        cov_imu, yaw_sigma = covariances_of(linear, settled.data, settled.estimate.states)
+    except TrajectoryError:
+        # What is left of the data determines nothing; that the fixes are lost says why.
+        gone = lost_fixes(robust.data, robust.dropped)
+        if gone is None:
+            raise
+        raise TrajectoryError(gone.sentence(data.name, data.wheels is None)) from None
     last = _last_step(settled, linear, cov_imu, nodes, robust.dropped, errors)
     data, estimate = last.settled.data, last.settled.estimate
     # Only those at wanted stamps are asked for: the memory of the others grows with the drive.
@@ -172,6 +175,26 @@ def _begun_at(
     if offsets:
         data, _ = moved(data, fresh, np.concatenate(offsets))
     return data, earlier.states_at(nodes), found
+
+
+def _settled(
+    robust: Robust,
+    nodes: IntArray,
+    begun: list[Estimate],
+    parameters: tuple[UncertainParameter, ...],
+) -> tuple[Robust, Settled]:
+    """States and parameters, from the estimate in `begun`, which is taken out."""
+    data, kernel = robust.data, robust.data.config.robust.kernel
+    if not parameters:
+        return robust, Settled(data, begun.pop())
+    settled = settle(data, nodes, begun.pop(), robust.dropped, kernel, parameters)
+    if late := with_late_clock(settled):
+        settled = settle(settled.data, nodes, settled.estimate, robust.dropped, kernel, late)
+        # Fixes that the wrong time had put beside the path.
+        robust, estimate = solve_without_outliers(settled.data, nodes, settled.estimate.states)
+        late = settled.parameters
+        settled = settle(robust.data, nodes, estimate, robust.dropped, kernel, late)
+    return robust, settled
 
 
 def _first_states(data: SmootherInput, nodes: IntArray) -> States:

@@ -514,17 +514,13 @@ def tilt_finding(tilt: VehicleTilt, config: Config) -> Finding | None:
 
 def fixes_finding(name: str, found: LostFixes, has_imu: bool) -> Finding:
     """Fixes of which the motion contradicts most."""
-    with_imu = "that the IMU's yaw counts from east to the left, " if has_imu else ""
     return Finding(
         "topics.gnss or the motion data",
         (),
         0.0,
         found.sigmas,
         "contradiction",
-        f"{name}: {found.dropped} of {found.count} GNSS fixes disagree with the motion, each by "
-        f"more than {found.sigmas:.1f} sigma: with most of them dropped the vehicle's path is not "
-        f"known. Check that latitude and longitude are in degrees, {with_imu}gnss.lever_arm, and "
-        f"the clocks of GNSS and {'IMU' if has_imu else 'velocities'}",
+        found.sentence(name, has_imu),
     )
 
 

@@ -247,9 +247,8 @@ class _Residuals:
         )
         if not moved.speed_alone:
             return r
-        # The axes in which they are measured turn with the mounting of the IMU, the roots do not.
-        # Lateral parts of several forward velocities around a node are noise, of metres per second:
-        # turned into the forward part, they would tell the mounting.
+        # The axes in which they are measured turn with the mounting of the IMU, the roots do not:
+        # the lateral velocity of the IMU's lever would be told apart from the forward one.
         then, now = (
             of.T_vehicle_twist.between(of.T_vehicle_imu).rotation().matrix()
             for of in (self._data, moved)

@@ -267,9 +267,9 @@ class Gaussian:
     """A Gaussian on several variables at once: a quadratic in right perturbations about its means.
 
     Twice its error is `d^T information d - 2 gradient^T d + constant`, where d has `log(T0^-1 T)`
-    of poses and rotations (of poses rotation then translation) and differences of vectors. Poses of
-    the vehicle about means without heave are in a `chart` instead, and so are those of which a
-    LiDAR on it tells (`carried`).
+    of poses and rotations (of poses rotation then translation) and differences of vectors. In their
+    place, poses of the vehicle about means without heave have coordinates of a `chart`, and those
+    of which a LiDAR on it tells coordinates behind that (`carried`): one of both, or none.
 
     Attributes:
         keys: its variables.
@@ -278,8 +278,8 @@ class Gaussian:
         gradient: (n,).
         constant: what makes the error positive.
         chart: of its poses, all the vehicle's; None: their logarithms.
-        carried: key of an extrinsic E among `keys`; poses before it are the vehicle's. Those of the
-            LiDAR, X E, are what is known: X has the coordinates
+        carried: key of an extrinsic E among `keys`, which begin with the vehicle's poses. Where a
+            LiDAR is, X E, is what is known: X has the coordinates
             `Ad(E0) (log((X0 E0)^-1 X E) - log(E0^-1 E))`, to the first order those of X alone. A
             turn of the vehicle frame, `X a` and `a^-1 E`, and a motion of the map, `b X`, are
             straight lines in them at once. None: no such extrinsic.

@@ -197,13 +197,15 @@ def velocities_at_nodes(
     scale: float = 1.0,
     late_ns: int = 0,
     slip_s2_m: float = 0.0,
+    alone: BoolArray | None = None,
 ) -> NodeVelocities | None:
     """Averages the velocities around each node; None if there are none.
 
     They are those of the origin of the twist's frame, mostly the vehicle's; `scale` is measured
     over true ones, `late_ns` the stamps less the true times. The lever to the IMU enters with the
     gyroscope's rate and its noise. `slip_s2_m` is the side slip of an axle, radians per m/s^2 of
-    lateral acceleration, to the outside of a curve.
+    lateral acceleration, to the outside of a curve. `alone` (n,) are the messages of which only the
+    forward velocity is measured; None: none.
     """
     usable = np.isfinite(twist.velocity).all(axis=1)
     usable &= (twist.stamps_ns >= nodes_ns[0]) & (twist.stamps_ns <= nodes_ns[-1])
@@ -233,11 +235,11 @@ def velocities_at_nodes(
     cov_node = rotated(dR, cov_imu) + np.abs(delay_s)[:, None, None] * noise.force_density
     late = delay_s[:, None, None] * np.eye(3)
     values = np.dstack([carried[:, :, None], late])
-    alone = cov[usable][:, 1, 1] >= UNMEASURED_M_S**2
-    if alone.any():
-        ahead_node = (dR @ R_imu_twist)[alone, :, 0]
-        one = _forward_mean(node[alone], ahead_node, values[alone], cov_node[alone])
-        both = (node[~alone], one[0]), (values[~alone], one[1]), (cov_node[~alone], one[2])
+    if alone is not None and alone[usable].any():
+        own = alone[usable]
+        ahead_node = (dR @ R_imu_twist)[own, :, 0]
+        one = _forward_mean(node[own], ahead_node, values[own], cov_node[own])
+        both = (node[~own], one[0]), (values[~own], one[1]), (cov_node[~own], one[2])
         node, values, cov_node = map(np.concatenate, both)
     nodes, mean, mean_cov = _weighted_mean(node, values, cov_node)
     return NodeVelocities(nodes, mean[:, :, 0], mean[:, :, 1:], mean_cov)

@@ -21,7 +21,7 @@ from caliv_graph.trajectory.measurements import (
     velocities_at_nodes,
 )
 from caliv_graph.trajectory.noise import orientation_covariances, velocity_covariances
-from caliv_graph.trajectory.wheels import forward_alone, wheel_covariances
+from caliv_graph.trajectory.wheels import forward_alone, stands, wheel_covariances
 
 NODE_SPACING_S = 0.1
 """Largest distance of two nodes on drives of up to `FINE_NODES` of them. A GNSS fix is then carried
@@ -102,6 +102,7 @@ def carry_to_nodes(
             data.speed_scale,
             0 if data.wheels is None else imu_late,
             data.axle_slip,
+            ~stands(data.motion.twist) if data.speed_alone else None,
         )
     headings = baselines = None
     if data.headings is not None and "heading" in kinds:

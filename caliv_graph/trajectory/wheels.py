@@ -16,7 +16,7 @@ import numpy as np
 
 from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import Array, IntArray, TwistSamples
+from caliv_graph.products import Array, BoolArray, IntArray, TwistSamples
 from caliv_graph.trajectory.imu import (
     NO_GAPS,
     DeadReckoning,
@@ -86,6 +86,11 @@ def is_planar(twist: TwistSamples) -> bool:
     return bool(velocity[:, 1:].max() <= ROUNDING * velocity[:, 0].max())
 
 
+def stands(twist: TwistSamples) -> BoolArray:
+    """(n,) messages of a vehicle that stands, by its forward velocity."""
+    return np.asarray(np.abs(twist.velocity[:, 0]) <= STANDING_M_S)
+
+
 def forward_alone(cov: Array, twist: TwistSamples) -> Array:
     """(n, 3, 3) covariances of planar velocities beside an IMU, from stated ones, (m/s)^2.
 
@@ -94,7 +99,7 @@ def forward_alone(cov: Array, twist: TwistSamples) -> Array:
     """
     out = np.zeros_like(cov)
     out[:, 0, 0] = cov[:, 0, 0]
-    standing = np.abs(twist.velocity[:, 0]) <= STANDING_M_S
+    standing = stands(twist)
     for axis in (1, 2):
         out[:, axis, axis] = np.where(standing, cov[:, axis, axis], UNMEASURED_M_S**2)
     return out

@@ -119,7 +119,13 @@ def test_forward_velocities_along_axes_that_turn_tell_none_to_the_side() -> None
     T_twist_imu = gtsam.Pose3(gtsam.Rot3(), offset)
 
     found = velocities_at_nodes(
-        odometry, cov, nodes, dead, imu_noise(samples, config_for(Sensors())), T_twist_imu
+        odometry,
+        cov,
+        nodes,
+        dead,
+        imu_noise(samples, config_for(Sensors())),
+        T_twist_imu,
+        alone=np.ones(len(noise), dtype=bool),
     )
 
     assert found is not None

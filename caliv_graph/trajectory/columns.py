@@ -247,8 +247,8 @@ class _Residuals:
         )
         if not moved.speed_alone:
             return r
-        # The axes in which they are measured turn with the mounting of the IMU, the roots do not:
-        # the lateral velocity of the IMU's lever would be told apart from the forward one.
+        # The axes in which they are measured turn with the mounting of the IMU, the roots do not.
+        # What a speed is compared with is the velocity along the axes as they are now.
         then, now = (
             of.T_vehicle_twist.between(of.T_vehicle_imu).rotation().matrix()
             for of in (self._data, moved)

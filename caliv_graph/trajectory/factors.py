@@ -333,8 +333,8 @@ class Gaussian:
     def _rows(self, key: int) -> slice:
         """Where the coordinates of a variable are."""
         at = self.keys.index(key)
-        first, size = (sum(map(tangent_size, self.means[:end])) for end in (at, at + 1))
-        return slice(first, size)
+        first = sum(map(tangent_size, self.means[:at]))
+        return slice(first, first + tangent_size(self.means[at]))
 
     def _apart(self, values: gtsam.Values) -> tuple[Array, list[Array], Array]:
         """Coordinates d (n,) from the means; derivatives by right perturbations, in blocks.

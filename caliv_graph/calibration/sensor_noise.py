@@ -63,6 +63,12 @@ LEVELS: Mapping[str, Unknown] = {
 """White errors, a sigma each: of the registration as a factor, else in metres and radians. The
 usual figures are weak priors, a factor of ten."""
 
+LEVELS_OF_WHEELS: Mapping[str, Unknown] = {
+    **LEVELS,
+    "heave": Unknown(HEAVE_SIGMA_M, LOG_SPREAD, (HEAVE_SIGMA_M, MOST.heave_m)),
+}
+"""The same where the motion is that of wheels (`_levels_looked_for`)."""
+
 TIME = Unknown(TYPICAL_CORRELATION_S, math.log(3.0), (2.0, 300.0))
 """Correlation time in seconds: below, the error is as good as white; above, it is constant over a
 drive, which extrinsics and target take up."""
@@ -146,11 +152,26 @@ def estimated_noise(
     evidence = linearised_evidence(state, registrations, trajectories, structure)
     if evidence is None:
         return noise_of_motion(trajectories, noise, structure)
-    found = estimated(evidence, noise)
+    levels = _levels_looked_for(trajectories)
+    found = estimated(evidence, noise, levels)
     if again := _with_other_levels(found, evidence, trajectories):
         evidence = replace(evidence, motion=motion_evidence(again, structure).motion)
-        found = estimated(evidence, noise)
+        found = estimated(evidence, noise, levels)
     return found
+
+
+def _levels_looked_for(trajectories: Sequence[VehicleTrajectory]) -> Mapping[str, Unknown]:
+    """`LEVELS`, with a heave that is at least the usual one where a drive has no IMU.
+
+    Without one the path is as smooth as fixes a fifth of a second apart can tell, and bumps are in
+    its errors: they leave little to a heave. That came out at 0.4 mm, and a vertical velocity that
+    wheels are assumed not to have told S2V pitch and x, 18 mrad and 62 mm off at 4.6 and 13 (random
+    drive 137 of the second simulator).
+    """
+    of_wheels = (
+        isinstance(t, SmoothedTrajectory) and t.data.wheels is not None for t in trajectories
+    )
+    return LEVELS_OF_WHEELS if any(of_wheels) else LEVELS
 
 
 def noise_of_motion(
@@ -222,8 +243,10 @@ def _usual(noise: NoiseConfig) -> SensorNoise:
     return SensorNoise(noise.heave_m or HEAVE_SIGMA_M, ground_floors(noise))
 
 
-def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
-    """The noise levels that a config leaves open."""
+def estimated(
+    evidence: Evidence, noise: NoiseConfig, levels: Mapping[str, Unknown] = LEVELS
+) -> SensorNoise:
+    """The noise levels that a config leaves open; `levels` are those of white errors."""
     usual = _usual(noise)
     given = {
         "heave": noise.heave_m,
@@ -235,14 +258,14 @@ def estimated(evidence: Evidence, noise: NoiseConfig) -> SensorNoise:
     stated = [s**2 * evidence.white[n] for n, s in given.items() if s and n in evidence.white]
     known = np.sum([evidence.observed.known, *stated], axis=0)
     evidence = replace(evidence, observed=replace(evidence.observed, known=known))
-    best = _fitted(evidence, names, (), None)
+    best = _fitted(evidence, levels, names, (), None)
     kinds = _looked_for(noise, evidence)
     while kinds:
         start = _best_start(evidence, names, best, kinds)
         if start is None:
             break
         before = [(error.kind, _start_of(error)) for error in best.errors]
-        better = _fitted(evidence, names, [*before, start], best)
+        better = _fitted(evidence, levels, names, [*before, start], best)
         if best.cost - better.cost < EVIDENCE:
             break
         best = better
@@ -339,16 +362,17 @@ class _Fit:
 
 def _fitted(
     evidence: Evidence,
+    white_levels: Mapping[str, Unknown],
     names: Sequence[str],
     slow: Sequence[tuple[str, Array]],
     start: _Fit | None,
 ) -> _Fit:
-    """The most likely levels of `names`, factors of the clouds, and correlated errors.
+    """The most likely of the `white_levels` of `names`, factors of the clouds, correlated errors.
 
     `slow` are the kinds of these, and where their search begins: sigmas of the groups, then the
     time. That of the others begins at `start`.
     """
-    levels, clouds = [LEVELS[name] for name in names], [CLOUD] * len(evidence.clouds)
+    levels, clouds = [white_levels[name] for name in names], [CLOUD] * len(evidence.clouds)
     unknowns = [*levels, *clouds]
     first = [u.median for u in unknowns] if start is None else [*start.white, *start.factors]
     for kind, values in slow:

@@ -11,8 +11,10 @@ import pytest
 
 from caliv_graph.calibration import sensor_noise
 from caliv_graph.calibration.evidence import Evidence, motion_evidence
+from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.sensor_noise import (
     LEVELS,
+    LEVELS_OF_WHEELS,
     OPEN,
     SLOW,
     SensorNoise,
@@ -99,6 +101,18 @@ def test_heave_is_found_and_no_error_where_there_is_none(heave_m: float) -> None
     sources = {level.name: level.source for level in found.levels}
     assert sources["heave"] == "residuals of the LiDARs"
     assert sources["ground_normal"] == "the usual figure"
+
+
+def test_without_an_imu_the_heave_is_at_least_the_usual_one() -> None:
+    made = evidence(1, 3e-4, None)
+    assert estimated(made, NoiseConfig()).heave_m < 1.5e-3
+
+    found = estimated(made, NoiseConfig(), LEVELS_OF_WHEELS)
+
+    assert found.heave_m == pytest.approx(HEAVE_SIGMA_M)
+    assert estimated(made, NoiseConfig(heave_m=2e-3), LEVELS_OF_WHEELS).heave_m == 2e-3
+    larger = estimated(evidence(1, 12e-3, None), NoiseConfig(), LEVELS_OF_WHEELS)
+    assert larger.heave_m == pytest.approx(12e-3, rel=0.35)
 
 
 def test_an_error_of_the_fixes_that_is_correlated_over_time_is_found() -> None:

@@ -63,12 +63,6 @@ LEVELS: Mapping[str, Unknown] = {
 """White errors, a sigma each: of the registration as a factor, else in metres and radians. The
 usual figures are weak priors, a factor of ten."""
 
-LEVELS_OF_WHEELS: Mapping[str, Unknown] = {
-    **LEVELS,
-    "heave": Unknown(HEAVE_SIGMA_M, LOG_SPREAD, (HEAVE_SIGMA_M, MOST.heave_m)),
-}
-"""The same where the motion is that of wheels (`_levels_looked_for`)."""
-
 TIME = Unknown(TYPICAL_CORRELATION_S, math.log(3.0), (2.0, 300.0))
 """Correlation time in seconds: below, the error is as good as white; above, it is constant over a
 drive, which extrinsics and target take up."""
@@ -152,15 +146,17 @@ def estimated_noise(
     evidence = linearised_evidence(state, registrations, trajectories, structure)
     if evidence is None:
         return noise_of_motion(trajectories, noise, structure)
-    levels = _levels_looked_for(trajectories)
-    found = estimated(evidence, noise, levels)
+    of_wheels = any(
+        isinstance(t, SmoothedTrajectory) and t.data.wheels is not None for t in trajectories
+    )
+    found = estimated(evidence, noise, of_wheels)
     if again := _with_other_levels(found, evidence, trajectories):
         evidence = replace(evidence, motion=motion_evidence(again, structure).motion)
-        found = estimated(evidence, noise, levels)
+        found = estimated(evidence, noise, of_wheels)
     return found
 
 
-def _levels_looked_for(trajectories: Sequence[VehicleTrajectory]) -> Mapping[str, Unknown]:
+def _white_levels(of_wheels: bool) -> Mapping[str, Unknown]:
     """`LEVELS`, with a heave that is at least the usual one where a drive has no IMU.
 
     Without one the path is as smooth as fixes a fifth of a second apart can tell, and bumps are in
@@ -168,10 +164,10 @@ def _levels_looked_for(trajectories: Sequence[VehicleTrajectory]) -> Mapping[str
     wheels are assumed not to have told S2V pitch and x, 18 mrad and 62 mm off at 4.6 and 13 (random
     drive 137 of the second simulator).
     """
-    of_wheels = (
-        isinstance(t, SmoothedTrajectory) and t.data.wheels is not None for t in trajectories
-    )
-    return LEVELS_OF_WHEELS if any(of_wheels) else LEVELS
+    if not of_wheels:
+        return LEVELS
+    heave = LEVELS["heave"]
+    return {**LEVELS, "heave": replace(heave, bounds=(heave.median, heave.bounds[1]))}
 
 
 def noise_of_motion(
@@ -243,10 +239,8 @@ def _usual(noise: NoiseConfig) -> SensorNoise:
     return SensorNoise(noise.heave_m or HEAVE_SIGMA_M, ground_floors(noise))
 
 
-def estimated(
-    evidence: Evidence, noise: NoiseConfig, levels: Mapping[str, Unknown] = LEVELS
-) -> SensorNoise:
-    """The noise levels that a config leaves open; `levels` are those of white errors."""
+def estimated(evidence: Evidence, noise: NoiseConfig, of_wheels: bool = False) -> SensorNoise:
+    """The noise levels that a config leaves open; `of_wheels`: the motion is that of wheels."""
     usual = _usual(noise)
     given = {
         "heave": noise.heave_m,
@@ -258,6 +252,7 @@ def estimated(
     stated = [s**2 * evidence.white[n] for n, s in given.items() if s and n in evidence.white]
     known = np.sum([evidence.observed.known, *stated], axis=0)
     evidence = replace(evidence, observed=replace(evidence.observed, known=known))
+    levels = _white_levels(of_wheels)
     best = _fitted(evidence, levels, names, (), None)
     kinds = _looked_for(noise, evidence)
     while kinds:

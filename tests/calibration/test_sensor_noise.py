@@ -14,7 +14,6 @@ from caliv_graph.calibration.evidence import Evidence, motion_evidence
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.sensor_noise import (
     LEVELS,
-    LEVELS_OF_WHEELS,
     OPEN,
     SLOW,
     SensorNoise,
@@ -107,11 +106,11 @@ def test_without_an_imu_the_heave_is_at_least_the_usual_one() -> None:
     made = evidence(1, 3e-4, None)
     assert estimated(made, NoiseConfig()).heave_m < 1.5e-3
 
-    found = estimated(made, NoiseConfig(), LEVELS_OF_WHEELS)
+    found = estimated(made, NoiseConfig(), of_wheels=True)
 
     assert found.heave_m == pytest.approx(HEAVE_SIGMA_M)
-    assert estimated(made, NoiseConfig(heave_m=2e-3), LEVELS_OF_WHEELS).heave_m == 2e-3
-    larger = estimated(evidence(1, 12e-3, None), NoiseConfig(), LEVELS_OF_WHEELS)
+    assert estimated(made, NoiseConfig(heave_m=2e-3), of_wheels=True).heave_m == 2e-3
+    larger = estimated(evidence(1, 12e-3, None), NoiseConfig(), of_wheels=True)
     assert larger.heave_m == pytest.approx(12e-3, rel=0.35)
 
 

@@ -26,7 +26,7 @@ from caliv_graph.trajectory.given_physics import impossible_speed, poses_physics
 from caliv_graph.trajectory.heading import heading_disagreement
 from caliv_graph.trajectory.outliers import lost_fixes
 from caliv_graph.trajectory.physics import motion_physics
-from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses
+from caliv_graph.trajectory.select import VehicleTrajectory, is_of_wheels, takes_given_poses
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.tilt import vehicle_tilt
 from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS
@@ -97,9 +97,9 @@ def smoothed_findings(
         if isinstance(trajectory, SmoothedTrajectory):
             lost = lost_fixes(trajectory.data, trajectory.gnss_dropped)
             if lost is not None:
-                has_imu = not _is_of_wheels(trajectory)
+                has_imu = not is_of_wheels(trajectory)
                 out.append(fixes_finding(trajectory.data.name, lost, has_imu))
-        if not _is_of_wheels(trajectory):
+        if not is_of_wheels(trajectory):
             tilt = vehicle_tilt(trajectory, motions[index].name, config)
             found, lies = tilt_finding(tilt, config), tilt.lies
             if found is not None:
@@ -108,11 +108,6 @@ def smoothed_findings(
             grounds = lidar_grounds(recording, trajectory, config, progress)
             out += guess_findings(recording.name, misfits(grounds, config), config)
     return tuple(out)
-
-
-def _is_of_wheels(trajectory: VehicleTrajectory) -> bool:
-    """Whether roll and pitch are those of level ground: there was no IMU."""
-    return isinstance(trajectory, SmoothedTrajectory) and trajectory.data.wheels is not None
 
 
 def clock_findings(

@@ -28,7 +28,12 @@ from caliv_graph.products import (
 )
 from caliv_graph.readers.pose_frame import poses_source
 from caliv_graph.trajectory.heading import HeadingDisagreement, heading_disagreement
-from caliv_graph.trajectory.select import VehicleTrajectory, takes_given_poses, twists_at
+from caliv_graph.trajectory.select import (
+    VehicleTrajectory,
+    is_of_wheels,
+    takes_given_poses,
+    twists_at,
+)
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.uncertainty import consistency
 from caliv_graph.uncertainty.consistency import (
@@ -128,9 +133,7 @@ def check(
     # Of guesses that are off together none is more likely wrong than the others.
     of_all = any(isinstance(each, GuessesTogether) for each in found)
     one = leads and not (of_all and suspects[0].input.endswith(".initial"))
-    of_wheels = any(
-        isinstance(t, SmoothedTrajectory) and t.data.wheels is not None for t in trajectories
-    )
+    of_wheels = any(map(is_of_wheels, trajectories))
     sentences = [ranking_sentence(suspects, of_wheels)] if one else []
     given = _given(motions, config)
     sentences += [contradiction_sentence(each, one, given) for each in found]

@@ -44,7 +44,7 @@ from caliv_graph.products import Array, NoiseLevel, Registration
 from caliv_graph.targets.ground.planes import DISTANCE_FLOOR_M, NORMAL_FLOOR_RAD, ground_floors
 from caliv_graph.trajectory.correlated import GROUPS, CorrelatedError
 from caliv_graph.trajectory.noise import TYPICAL_CORRELATION_S
-from caliv_graph.trajectory.select import VehicleTrajectory
+from caliv_graph.trajectory.select import VehicleTrajectory, is_of_wheels
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.variances import LARGEST_RIGHT
@@ -146,9 +146,7 @@ def estimated_noise(
     evidence = linearised_evidence(state, registrations, trajectories, structure)
     if evidence is None:
         return noise_of_motion(trajectories, noise, structure)
-    of_wheels = any(
-        isinstance(t, SmoothedTrajectory) and t.data.wheels is not None for t in trajectories
-    )
+    of_wheels = any(map(is_of_wheels, trajectories))
     found = estimated(evidence, noise, of_wheels)
     if again := _with_other_levels(found, evidence, trajectories):
         evidence = replace(evidence, motion=motion_evidence(again, structure).motion)

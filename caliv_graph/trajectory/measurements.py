@@ -265,10 +265,10 @@ def _forward_mean(
     weight = 1.0 / np.einsum("mi,mij,mj->m", ahead, cov, ahead)
     along = np.einsum("mi,mic->mc", ahead, values)
     total = np.add.reduceat(weight, starts)
+    share = weight / np.repeat(total, np.diff(starts, append=len(group)))
 
     def mean(of: Array) -> Array:
-        each = of.reshape(len(of), -1) * weight[:, None]
-        return np.asarray(np.add.reduceat(each, starts) / total[:, None]).reshape(-1, *of.shape[1:])
+        return np.asarray(np.add.reduceat(np.einsum("m,m...->m...", share, of), starts))
 
     axis = mean(ahead)
     length = np.linalg.norm(axis, axis=1)

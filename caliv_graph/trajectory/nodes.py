@@ -21,7 +21,7 @@ from caliv_graph.trajectory.measurements import (
     velocities_at_nodes,
 )
 from caliv_graph.trajectory.noise import orientation_covariances, velocity_covariances
-from caliv_graph.trajectory.wheels import forward_alone, stands, wheel_covariances
+from caliv_graph.trajectory.wheels import forward_alone, wheel_covariances
 
 NODE_SPACING_S = 0.1
 """Largest distance of two nodes on drives of up to `FINE_NODES` of them. A GNSS fix is then carried
@@ -102,7 +102,7 @@ def carry_to_nodes(
             data.speed_scale,
             0 if data.wheels is None else imu_late,
             data.axle_slip,
-            ~stands(data.motion.twist) if data.speed_alone else None,
+            forward_alone(data.motion.twist) if data.speed_alone else None,
         )
     headings = baselines = None
     if data.headings is not None and "heading" in kinds:
@@ -126,7 +126,7 @@ def _velocity_covariances(data: SmootherInput) -> Array:
     else:
         cov, _ = velocity_covariances(twist, data.config)
         if data.speed_alone:
-            cov = forward_alone(cov, twist)
+            cov = cov * np.eye(3)  # zeros beside the forward velocity are correlated with nothing
     # Of planar velocities `speed` is estimated in the place of `velocity`.
     axes = data.scales.get("velocity", 1.0) * axes
     return np.asarray(cov * np.outer(axes, axes))

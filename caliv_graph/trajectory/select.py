@@ -164,6 +164,11 @@ def are_given(trajectories: Sequence[VehicleTrajectory]) -> bool:
     return all(isinstance(trajectory, GivenTrajectory) for trajectory in trajectories)
 
 
+def is_of_wheels(trajectory: VehicleTrajectory) -> bool:
+    """Whether wheels stand in for an IMU: roll and pitch are those of level ground."""
+    return isinstance(trajectory, SmoothedTrajectory) and trajectory.data.wheels is not None
+
+
 def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
     trajectory = given_trajectory(motion)
     begin, end = GivenTrajectory(trajectory).span_ns

@@ -86,23 +86,13 @@ def is_planar(twist: TwistSamples) -> bool:
     return bool(velocity[:, 1:].max() <= ROUNDING * velocity[:, 0].max())
 
 
-def stands(twist: TwistSamples) -> BoolArray:
-    """(n,) messages of a vehicle that stands, by its forward velocity."""
-    return np.asarray(np.abs(twist.velocity[:, 0]) <= STANDING_M_S)
-
-
-def forward_alone(cov: Array, twist: TwistSamples) -> Array:
-    """(n, 3, 3) covariances of planar velocities beside an IMU, from stated ones, (m/s)^2.
+def forward_alone(twist: TwistSamples) -> BoolArray:
+    """(n,) planar velocities beside an IMU that are forward only: of a vehicle that moves.
 
     What moves sideways is the axle, not the vehicle's origin: 1.4 m before it, in a curve of 10 m,
     the origin goes 140 mrad beside the vehicle's x. Forward velocities are alike all along x.
     """
-    out = np.zeros_like(cov)
-    out[:, 0, 0] = cov[:, 0, 0]
-    standing = stands(twist)
-    for axis in (1, 2):
-        out[:, axis, axis] = np.where(standing, cov[:, axis, axis], UNMEASURED_M_S**2)
-    return out
+    return ~(np.abs(twist.velocity[:, 0]) <= STANDING_M_S)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ Solution -> Uncertainty -> Calibration. Frames and tangent order are in `convent
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -375,6 +376,7 @@ class GroundObservation:
             waves and bends that it shares with other scans; None: it shares nothing.
         bent: part of the scans of its drive in which the ground is bent, of the LiDAR that finds it
             so most often.
+        roughness_m: scatter of the ground within a square metre, 1 sigma; nan: not known.
     """
 
     lidar: str
@@ -400,6 +402,7 @@ class GroundObservation:
     R_map_vehicle: Array | None = None
     repeated: Array | None = None
     bent: float = 0.0
+    roughness_m: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -779,6 +782,7 @@ class Solution:
         warnings: for the user, a line each.
         gradient_data: (6n,) of the data's log-likelihood at the estimate; None: not computed.
         course: the iterations of the joint loop; empty without a target.
+        creeps: whether they ended far from where they lead.
         sensor_noise: noise levels that no message states, and where their figures are from.
         structure: the structure of each drive that has any.
     """
@@ -812,6 +816,7 @@ class Solution:
     vehicle: Mapping[str, VehicleParameter] = field(default_factory=dict)
     information_knowing: Mapping[str, Array] = field(default_factory=dict)
     course: tuple[Iteration, ...] = ()
+    creeps: bool = False
     sensor_noise: tuple[NoiseLevel, ...] = ()
     structure: tuple[StructureTerm, ...] = ()
 

@@ -42,11 +42,8 @@ PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Prior of a plane: 45 degrees, and 100 m about the drive's poses. It is weak beside the guesses of
 the extrinsics; without it a plane that no LiDAR sees would be singular."""
 
-GROUND_BIASES = 3 + 3
+GROUND_BIASES = 3 + 4
 """Number of errors that a LiDAR has in common on all the ground it sees: `bias_sigmas`."""
-
-LEAST_TILT_RAD = 1e-6
-"""1 sigma of a tilt that is none: far below what any drive tells."""
 
 TOGETHER_NS = 5_000_000
 """A scan nearer to a pose than this has the heave of that pose: a body that heaves by 5 mm at 2 Hz
@@ -136,15 +133,14 @@ def first_heave(problem: Problem, observation: GroundObservation) -> float:
 
 
 def bias_sigmas(ranges: RangeErrors) -> Array:
-    """(6,) 1 sigma of what a LiDAR has in common on all the ground that it sees.
+    """(7,) 1 sigma of what a LiDAR has in common on all the ground that it sees.
 
-    Biases of the ranges, constant and the two of `config.range_errors.growth`, metres; and the turn
-    in which it sees the ground, rad, lidar axes. Every scan has the same ones, so that they do not
-    average out: they lift and tilt its planes.
+    Biases of the ranges, constant and the two of `config.range_errors.growth`, metres; and the
+    frame in which it sees the ground (`RangeErrors.ground_frame`). Every scan has the same ones, so
+    that they do not average out: they lift and tilt its planes.
     """
     constant_m = math.hypot(ranges.offsets.usual, ranges.ground_m)
-    tilt_rad = max(ranges.ground_tilt_rad, LEAST_TILT_RAD)
-    return np.array([constant_m, *[ranges.incidence_m] * 2, *[tilt_rad] * 3])
+    return np.array([constant_m, *[ranges.incidence_m] * 2, *ranges.ground_frame])
 
 
 def ground_graph(

@@ -152,8 +152,9 @@ def ground_plane_factor(
         observation: the measurement.
         weight: on its information.
         heave_m: 1 sigma of heave between scan and pose, beside the observation's covariance.
-        key_bias: of the LiDAR's range biases, and of the turn in which it sees all ground (3,
-            lidar axes); None, or an observation that does not tell what the biases change: none.
+        key_bias: of the LiDAR's range biases, and of the frame in which it sees all ground (turn
+            (3,), lidar axes, and height); None, or an observation that does not tell what the
+            biases change: none.
         key_rates: of the errors of the drive's rates, likewise.
     """
     poses = list(pose_keys)
@@ -161,7 +162,7 @@ def ground_plane_factor(
     by_bias = observation.by_range_bias
     nuisances: dict[int, Array] = {}
     if key_bias is not None and by_bias is not None:
-        nuisances[key_bias] = np.hstack([by_bias, -by_turn(observation)])
+        nuisances[key_bias] = np.hstack([by_bias, -by_frame(observation)])
     if key_rates is not None and observation.by_rates is not None:
         nuisances[key_rates] = -observation.by_rates @ by_rates(_turning(observation))
     moving = _Moving.of(observation) if key_rates in nuisances else None
@@ -213,10 +214,12 @@ def ground_plane_factor(
     return gtsam.CustomFactor(noise, [*poses, key_plane, *nuisances], error)
 
 
-def by_turn(observation: GroundObservation) -> Array:
-    """(3, 3) change of what is predicted of (a, b, distance) if the LiDAR turns, lidar axes."""
-    of_normal = observation.axes_lidar @ skew(observation.normal_lidar)
-    return np.vstack([of_normal, np.zeros(3)])
+def by_frame(observation: GroundObservation) -> Array:
+    """(3, 4) change of what is predicted of (a, b, distance) if the LiDAR turns, and rises."""
+    out = np.zeros((3, 4))
+    out[:2, :3] = observation.axes_lidar @ skew(observation.normal_lidar)
+    out[2, 3] = 1.0
+    return out
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,11 @@ class NoiseConfig(Section):
         "against the plane that carries the wheels; absent: none on roads, by its roughness on "
         "grass and gravel",
     )
+    lidar_ground_height_m: Positive | None = Field(
+        None,
+        description="metres, 1 sigma of how much higher or lower each LiDAR sees all ground of a "
+        "drive than others do; absent: none on roads, by its roughness on grass and gravel",
+    )
     pose_position_m: Positive | None = Field(
         None,
         description="metres, white error of each given pose; absent: its message, or fitted",

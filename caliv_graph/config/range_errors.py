@@ -64,6 +64,10 @@ CHANNELS_APART_RAD = 0.01
 """Usual angle between two channels: in that distance an error of the beams is another."""
 
 
+LEAST_TILT_RAD, LEAST_HEIGHT_M = 1e-6, 1e-5
+"""1 sigma of a tilt and of a height of the ground that are none: far below what any drive tells."""
+
+
 @dataclass(frozen=True)
 class RangeErrors:
     """What a config says of them, metres.
@@ -75,6 +79,7 @@ class RangeErrors:
         surface_m: 1 sigma of one more bias on a surface, where nothing tells.
         beam_m: 1 sigma of one more bias of the beams at one elevation, where nothing tells.
         ground_tilt_rad: 1 sigma of the tilt in which a LiDAR sees all ground; not metres.
+        ground_height_m: 1 sigma of the height in which it sees all ground.
     """
 
     offset_m: float | None = None
@@ -83,6 +88,18 @@ class RangeErrors:
     surface_m: float = SURFACE_M
     beam_m: float = BEAM_M
     ground_tilt_rad: float = 0.0
+    ground_height_m: float = 0.0
+
+    @property
+    def sees_ground_apart(self) -> bool:
+        """Whether each LiDAR sees the ground in a frame of its own."""
+        return self.ground_tilt_rad > 0.0 or self.ground_height_m > 0.0
+
+    @property
+    def ground_frame(self) -> Array:
+        """(4,) 1 sigma of that frame: three turns, rad, lidar axes; a height, metres."""
+        tilt_rad = max(self.ground_tilt_rad, LEAST_TILT_RAD)
+        return np.array([*[tilt_rad] * 3, max(self.ground_height_m, LEAST_HEIGHT_M)])
 
     @property
     def beams(self) -> tuple[float, ...]:
@@ -121,6 +138,7 @@ def range_errors(noise: NoiseConfig) -> RangeErrors:
         surface_m=min(SURFACE_M, most_m),
         beam_m=min(BEAM_M, most_m),
         ground_tilt_rad=math.radians(noise.lidar_ground_tilt_deg or 0.0),
+        ground_height_m=noise.lidar_ground_height_m or 0.0,
     )
 
 

@@ -45,7 +45,7 @@ from caliv_graph.structure.range_noise import with_range_noise
 from caliv_graph.structure.read import ground_roughness_m, read_patches
 from caliv_graph.structure.without_targets import without_targets
 from caliv_graph.targets.cloud.extract import extract_targets
-from caliv_graph.targets.ground.measure import measure_grounds
+from caliv_graph.targets.ground.measure import measure_grounds, roughness_m
 from caliv_graph.targets.search import find_target
 from caliv_graph.targets.search.misplaced import realigned
 from caliv_graph.trajectory.odometry import OdometryPoses
@@ -167,7 +167,6 @@ def prepare(
     )
     observations = tuple(with_range_noise(o, patches) for o in observations)
     patches = tuple(without_targets(p, observations, rough[p.drive], config) for p in patches)
-    config, on_grass = _on_rough_ground(config, recordings, patches, rough)
     kept = kept_stamps(patches, usable(observations))
     if no_target is not None and not kept:
         raise no_target
@@ -186,6 +185,7 @@ def prepare(
         grounds, ground_warnings = measure_grounds(
             recordings, trajectories, observations, config, progress, others, kept
         )
+    config, on_grass = _on_rough_ground(config, recordings, grounds, patches, trajectories)
     warnings = [*pauses, *(w for r in recordings for w in r.warnings())]
     warnings += map(placement_sentence, placements)
     warnings += [w for t in trajectories for w in t.warnings]
@@ -328,6 +328,10 @@ TILT_PER_M = 0.05
 of blades changes with their length from place to place, and with the angle of its beams. Of two
 LiDARs and two drives on a meadow that scatters by 12 mm, roll and pitch were 0.6 mrad off each."""
 
+HEIGHT_SHARE = 0.2
+"""How much higher or lower a LiDAR sees all such ground than others do, 1 sigma, over its scatter:
+more of the flat beams end at the tips. 3 mm of 17 (drives in `structure/README.md`, section 8)."""
+
 LIFT = 1.5
 """Height of what LiDARs see of grass above the soil, over its scatter: blades have all lengths, and
 what they see of them begins at the soil."""
@@ -336,23 +340,27 @@ what they see of them begins at the soil."""
 def _on_rough_ground(
     config: Config,
     recordings: Sequence[Recording],
+    grounds: Sequence[GroundObservation],
     patches: Sequence[DrivePatches],
     trajectories: Sequence[VehicleTrajectory],
 ) -> tuple[Config, tuple[str, ...]]:
     """The config with larger sigmas of the ground where it is grass or gravel; warnings.
 
     Wheels stand lower there than what LiDARs see of the ground, all along the drive, and each LiDAR
-    sees it in a tilt of its own.
+    sees it in a frame of its own. By its planes; where there are none, by its patches, of which
+    grass leaves the smoothest or none.
     """
     ground, noise = config.ground, config.noise
     if not ground.use:
         return config, ()
     guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
-    rough = {}
-    for of in patches:
-        rough_m = ground_roughness_m(of, trajectories[of.drive], guesses)
+    rough, by_drive = {}, {of.drive: of for of in patches}
+    for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
+        rough_m = roughness_m(grounds, drive)
+        if rough_m is None and drive in by_drive:
+            rough_m = ground_roughness_m(by_drive[drive], trajectory, guesses)
         if rough_m is not None and rough_m > ROUGH_M:
-            rough[recordings[of.drive].name] = rough_m
+            rough[recording.name] = rough_m
     if not rough:
         return config, ()
     most_m = max(rough.values())
@@ -360,11 +368,15 @@ def _on_rough_ground(
     if ground.vehicle_height is not None:
         stated_m, used_m = ground.sigma, math.hypot(ground.sigma, LIFT * most_m)
     tilt_deg = noise.lidar_ground_tilt_deg or math.degrees(TILT_PER_M * most_m)
+    height_m = noise.lidar_ground_height_m or HEIGHT_SHARE * most_m
     known = {
         "ground": ground.model_copy(update={"sigma": used_m}),
-        "noise": noise.model_copy(update={"lidar_ground_tilt_deg": tilt_deg}),
+        "noise": noise.model_copy(
+            update={"lidar_ground_tilt_deg": tilt_deg, "lidar_ground_height_m": height_m}
+        ),
     }
-    said = rough_ground_sentence(rough, stated_m, used_m, math.radians(tilt_deg))
+    seen = (math.radians(tilt_deg), height_m)
+    said = rough_ground_sentence(rough, stated_m, used_m, seen)
     return config.model_copy(update=known), (said,)
 
 

@@ -351,8 +351,9 @@ def _seen_plane(
     # Predicted less measured: where the ground seems to rise, its normal leans back.
     changed = ground_by_range_bias(model)
     biases = _behind(columns.biases(name))
-    J[:, :2, biases] = np.concatenate([R[:, :2, :2] @ changed[:2], tilt], axis=2)
-    J[:, 2, biases] = np.append(changed[2], np.zeros(3))
+    lift = np.zeros((*tilt.shape[:2], 1))
+    J[:, :2, biases] = np.concatenate([R[:, :2, :2] @ changed[:2], tilt, lift], axis=2)
+    J[:, 2, biases] = [*changed[2], 0.0, 0.0, 0.0, 1.0]
 
 
 def _add_contact(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -16,6 +17,9 @@ from caliv_graph.trajectory.imu import exp_so3
 
 BIASES = 3
 """Biases of a LiDAR that hold for the whole drive: bias, growth with incidence, on the ground."""
+
+GROUND_FRAME = 4
+"""Coordinates of the frame in which a LiDAR sees the ground (`RangeErrors.ground_frame`)."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Nuisances:
             the beams fall, change along a wall slowly.
         repeated: share of the variances of `sighting` and `shared` that is the same in all scans
             from one place, beyond what `strip` has of it.
-        ground_tilt: tilt in which a LiDAR sees all level strips, rad; not metres.
+        ground_frame: (4,) turn, rad, and height in which a LiDAR sees all level strips.
         beams: (E,) of the errors of the beams of all LiDARs, as in `Layout.beams`: m, rad, rad,
             m/rad, rad/rad, by their kinds.
         jitter_s: of the stamp of each scan, s; 0: no such variables.
@@ -58,7 +62,7 @@ class Nuisances:
     strip_tilt: Array
     shared: float
     repeated: float
-    ground_tilt: float = 0.0
+    ground_frame: Array = field(default_factory=partial(np.zeros, GROUND_FRAME))
     beams: Array = field(default_factory=lambda: np.zeros(0))
     bend: Array = field(default_factory=lambda: np.zeros(0))
     jitter_s: float = 0.0
@@ -129,8 +133,8 @@ class Layout:
     In this order: poses (6 each), parameters of the vehicle, errors of the rates by which points
     were moved (`rates`, if any were), time offsets, extrinsics (6), bias of each LiDAR, its growth
     with incidence, and that on the ground (3), errors of the beams of each LiDAR, if they err
-    (kind by kind, of each all nodes), tilt in which each LiDAR sees the ground, if it is rough (3,
-    lidar axes), error of the vehicle's height and tilt above the ground (3),
+    (kind by kind, of each all nodes), frame in which each LiDAR sees the ground, if it is rough
+    (turn in lidar axes and height, 4), error of the vehicle's height and tilt above the ground (3),
     errors of the angular velocity within the scans at each pose, if there are any (3), jitter of
     the stamp of each scan, if there is any; and what belongs to one surface each: planes (two
     tilts, offset), bends of each strip, if they are bent (`BENDS` times K), bias of each LiDAR on
@@ -147,7 +151,7 @@ class Layout:
     turns: int = 0
     beams: tuple[BeamErrors, ...] = ()
     bent: bool = False
-    ground_tilts: int = 0
+    ground_frames: int = 0
 
     @property
     def strips(self) -> int:
@@ -197,11 +201,11 @@ class Layout:
     @property
     def standing(self) -> int:
         """Error of the vehicle's height above ground, and the two of its tilt."""
-        return self.ground_tilt + self.ground_tilts
+        return self.ground_frame + GROUND_FRAME * self.ground_frames
 
     @property
-    def ground_tilt(self) -> int:
-        """First tilt in which a LiDAR sees the ground; after the errors of the beams."""
+    def ground_frame(self) -> int:
+        """First turn in which a LiDAR sees the ground; after the errors of the beams."""
         return self.beam + sum(errors.size for errors in self.beams)
 
     @property
@@ -242,7 +246,7 @@ class Layout:
             [
                 np.tile(of_lidar, self.lidars),
                 nuisances.beams,
-                np.full(self.ground_tilts, nuisances.ground_tilt),
+                np.tile(nuisances.ground_frame, self.ground_frames),
                 np.tile(nuisances.bend, BENDS * self.bent),
                 np.full(self.lidars * self.surfaces, nuisances.surface),
                 np.tile(nuisances.strip, self.lidars),

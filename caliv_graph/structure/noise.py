@@ -419,7 +419,7 @@ def _beam_sigmas(
     """(E,) 1 sigma of each error of the beams of the LiDARs: `beam_sigmas` of a system."""
     if not len(before):
         return before
-    own = np.arange(layout.beam, layout.ground_tilt)
+    own = np.arange(layout.beam, layout.ground_frame)
     give_back_freed_arrays()  # of the other noise levels
     known = np.linalg.inv(covariance(own))
     J, _ = mean_rows(layout.beams, 0, errors[own])

@@ -256,7 +256,7 @@ def layout_of(problem: Problem, strips: Strips) -> Layout:
         turns=problem.turn_rad_s.size,
         beams=tuple(nodes.errors for nodes in problem.beam_nodes),
         bent=problem.bent,
-        ground_tilts=3 * len(problem.patches.lidars) * (problem.range_errors.ground_tilt_rad > 0.0),
+        ground_frames=len(problem.patches.lidars) * problem.range_errors.sees_ground_apart,
     )
 
 

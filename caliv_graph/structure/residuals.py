@@ -14,7 +14,7 @@ from caliv_graph.geometry.se3 import skew, stack, tangent_axes, twist_by_turn
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import SeenBeams
 from caliv_graph.structure.bends import BENDS
-from caliv_graph.structure.layout import BIASES, Layout, State
+from caliv_graph.structure.layout import BIASES, GROUND_FRAME, Layout, State
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.strips import LEVEL
 from caliv_graph.trajectory.imu import exp_so3
@@ -256,11 +256,13 @@ def geometry_of(
         of_beams += np.einsum("qc,qci->qi", state.errors[own], beams.by)
         parts.append(beams.by)
         columns.append(own)
-    if layout.ground_tilts:
-        own = layout.ground_tilt + 3 * lidar[:, None] + np.arange(3)
+    if layout.ground_frames:
+        own = layout.ground_frame + GROUND_FRAME * lidar[:, None] + np.arange(GROUND_FRAME)
         ground = normal[:, 2] > LEVEL
-        by_tilt = np.where(ground[:, None, None], by_extrinsic[:, :3], 0.0)
-        moved.append((by_tilt, own, state.errors[own]))
+        by_frame = np.zeros((q, GROUND_FRAME, 4))
+        by_frame[ground, :3] = by_extrinsic[ground, :3]
+        by_frame[ground, 3, 3] = 1.0
+        moved.append((by_frame, own, state.errors[own]))
     if layout.bent:
         own = layout.bend + layout.strips * np.arange(BENDS) + strip[:, None]
         bends = np.zeros((q, BENDS, 4)) if sightings.bends is None else sightings.bends

@@ -486,7 +486,7 @@ def _round(
         bias=levels.bias_m,
         incidence=problem.range_errors.incidence_m,
         ground=problem.range_errors.ground_m,
-        ground_tilt=problem.range_errors.ground_tilt_rad,
+        ground_frame=problem.range_errors.ground_frame,
         surface=levels.surface_m,
         strip=np.full(strips.count, levels.strip_m),
         sighting=np.full(strips.count, levels.sighting_m),

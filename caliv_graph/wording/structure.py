@@ -46,12 +46,16 @@ def standing_sentence(moved_m: float, turned_deg: float, lasts_s: float) -> str:
 
 
 def rough_ground_sentence(
-    roughness_m: Mapping[str, float], stated_m: float | None, used_m: float, tilt_rad: float
+    roughness_m: Mapping[str, float],
+    stated_m: float | None,
+    used_m: float,
+    seen: tuple[float, float],
 ) -> str:
     """The warning that the ground seen may not be what carries the wheels.
 
     `roughness_m` is that of each drive with such ground, by its name; `stated_m` 1 sigma of the
-    height as stated, None if no height is; `used_m` in its place; `tilt_rad` that of the tilt.
+    height as stated, None if no height is; `used_m` in its place; `seen` that of the tilt and the
+    height in which each LiDAR sees the ground, rad and metres.
     """
     drives = ", ".join(roughness_m)
     scatter = " and ".join(f"{1e3 * of:.0f}" for of in roughness_m.values())
@@ -65,8 +69,8 @@ def rough_ground_sentence(
     return (
         f"{drives}: the ground scatters by {scatter} mm from point to point, as grass "
         f"or gravel does: LiDARs see its tips, wheels sink in. {height}each LiDAR's ground is "
-        f"believed to {1e3 * tilt_rad:.2f} mrad of tilt, in all drives. For {better} use drives on "
-        "asphalt or concrete alone"
+        f"believed to {1e3 * seen[0]:.2f} mrad of tilt and {1e3 * seen[1]:.1f} mm of height, in "
+        f"all drives. For {better} use drives on asphalt or concrete alone"
     )
 
 

@@ -914,8 +914,9 @@ def test_scans_of_one_place_know_the_waves_of_the_ground_as_one_does(scans: int)
     assert 2.0 < squares([replace(o, repeated=None) for o in alike]) / squares([one]) < 4.0
 
 
-def test_on_grass_planes_tell_roll_and_pitch_no_better_than_each_lidar_sees_its_tilt() -> None:
-    """A turn of all ground that a LiDAR sees is one of the LiDAR, however many scans there are."""
+def test_on_grass_planes_tell_no_more_than_each_lidar_sees_its_frame() -> None:
+    """What all ground that a LiDAR sees is turned and lifted by is the LiDAR's own turn and height,
+    however many scans there are."""
     case = make_case(count=40)
     g = np.array([0.0, 0.0, GROUND_Z])
     seen = [
@@ -929,14 +930,18 @@ def test_on_grass_planes_tell_roll_and_pitch_no_better_than_each_lidar_sees_its_
         prior_graph(case.problem, case.problem.lidars),
     )
 
-    def level_rad(tilt_rad: float) -> Array:
-        """1 sigma of the second LiDAR against the first about two level axes."""
-        ranges = RangeErrors(ground_tilt_rad=tilt_rad)
+    def known(tilt_rad: float, height_m: float) -> Array:
+        """1 sigma of the second LiDAR against the first about two level axes, and of its height."""
+        ranges = RangeErrors(ground_tilt_rad=tilt_rad, ground_height_m=height_m)
         graph = merged(base, ground_graph(case.problem, seen, config, ranges=ranges))
         S = case.problem.extrinsic_keys_of("front")[-1]
-        cov = gtsam.Marginals(graph, values).marginalCovariance(S)[:3, :3]
-        return np.asarray(np.sqrt(np.linalg.eigvalsh(cov)[:2]))
+        cov = gtsam.Marginals(graph, values).marginalCovariance(S)
+        up = case.problem.extrinsic(values, "front").rotation().matrix()[2]
+        return np.sqrt([*np.linalg.eigvalsh(cov[:3, :3])[:2], up @ cov[3:, 3:] @ up])
 
-    on_road, on_grass = level_rad(0.0), level_rad(1e-3)
-    assert on_road.max() < 5e-4
-    assert on_grass == pytest.approx(np.hypot(on_road, math.sqrt(2.0) * 1e-3), rel=0.02)
+    on_road, on_grass = known(0.0, 0.0), known(1e-3, 0.0)
+    assert on_road[:2].max() < 5e-4
+    assert on_grass[:2] == pytest.approx(np.hypot(on_road[:2], math.sqrt(2.0) * 1e-3), rel=0.02)
+    lifted = known(0.0, 0.01)
+    assert lifted[:2] == pytest.approx(on_road[:2], rel=1e-3)
+    assert lifted[2] == pytest.approx(math.hypot(on_road[2], math.sqrt(2.0) * 0.01), rel=0.02)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -11,8 +11,14 @@ import numpy as np
 import pytest
 
 from caliv_graph.config.model import Config
-from caliv_graph.pipeline.preparation import LIFT, ROUGH_M, TILT_PER_M, _on_rough_ground
-from caliv_graph.products import Array, Recording
+from caliv_graph.pipeline.preparation import (
+    HEIGHT_SHARE,
+    LIFT,
+    ROUGH_M,
+    TILT_PER_M,
+    _on_rough_ground,
+)
+from caliv_graph.products import Array, GroundObservation, Recording
 from caliv_graph.structure.noise import roughness_m
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.read import ground_roughness_m, level
@@ -43,12 +49,26 @@ class Named:
     name = "meadow"
 
 
+def plane_seen(lidar: str, roughness_m: float, stamp_ns: int = 0) -> GroundObservation:
+    z, cov = np.array([0.0, 0.0, 1.0]), 1e-6 * np.eye(3)
+    axes = np.eye(3)[:2]
+    seen = GroundObservation(lidar, 0, stamp_ns, z, 1.0, axes, cov, -z, 400)
+    return replace(seen, roughness_m=roughness_m)
+
+
+def used(
+    planes: Sequence[GroundObservation], patches: Sequence[DrivePatches], **ground: object
+) -> tuple[Config, tuple[str, ...]]:
+    """The config that is used, and what is said."""
+    recordings = [cast("Recording", Named())]
+    return _on_rough_ground(config_of(**ground), recordings, planes, patches, [TRAJECTORY])
+
+
 def prepared(
     patches: DrivePatches, **ground: object
 ) -> tuple[float, float | None, tuple[str, ...]]:
     """Sigmas of the height and of the LiDARs' tilt (degrees) that are used, and what is said."""
-    recordings = [cast("Recording", Named())]
-    config, said = _on_rough_ground(config_of(**ground), recordings, [patches], [TRAJECTORY])
+    config, said = used([], [patches], **ground)
     return config.ground.sigma, config.noise.lidar_ground_tilt_deg, said
 
 
@@ -77,6 +97,50 @@ def test_on_grass_the_height_is_believed_less_and_it_is_said() -> None:
     assert "meadow: the ground scatters by" in said
     assert f"to {1e3 * used_m:.0f} mm in place of ground.sigma (5 mm)" in said
     assert f"to {1e3 * math.radians(tilt_deg):.2f} mrad of tilt" in said
+
+
+def test_planes_tell_it_where_grass_leaves_smooth_patches_or_none() -> None:
+    """Of blades of centimetres the patches that pass for flat are the smoothest, if any pass."""
+    planes = [plane_seen(name, GRASS_M, k) for name in TRUTH for k in range(8)]
+    for patches in ([on_grass([])], []):
+        config, (said,) = used(planes, patches, vehicle_height=0.3, sigma=0.005)
+        assert config.ground.sigma == pytest.approx(math.hypot(0.005, LIFT * GRASS_M))
+        assert config.noise.lidar_ground_tilt_deg == pytest.approx(
+            math.degrees(TILT_PER_M * GRASS_M)
+        )
+        assert config.noise.lidar_ground_height_m == pytest.approx(HEIGHT_SHARE * GRASS_M)
+        assert f"{1e3 * HEIGHT_SHARE * GRASS_M:.1f} mm of height" in said
+
+
+def test_what_is_stated_of_rough_ground_is_used() -> None:
+    planes = [plane_seen("front", GRASS_M, k) for k in range(8)]
+    config = config_of()
+    noise = config.noise.model_copy(
+        update={"lidar_ground_tilt_deg": 0.2, "lidar_ground_height_m": 0.004}
+    )
+    found, _ = _on_rough_ground(
+        config.model_copy(update={"noise": noise}),
+        [cast("Recording", Named())],
+        planes,
+        [],
+        [TRAJECTORY],
+    )
+    assert found.noise.lidar_ground_tilt_deg == 0.2
+    assert found.noise.lidar_ground_height_m == 0.004
+
+
+@pytest.mark.parametrize(
+    "planes",
+    [
+        [plane_seen("front", GRASS_M, k) for k in range(7)],
+        [plane_seen("front", math.nan, k) for k in range(20)],
+        [plane_seen(*of, k) for k in range(8) for of in (("front", GRASS_M), ("rear", 0.003))],
+    ],
+    ids=["few planes", "planes that do not tell", "one LiDAR's own noise"],
+)
+def test_planes_that_do_not_tell_of_grass(planes: Sequence[GroundObservation]) -> None:
+    config, said = used(planes, [], vehicle_height=0.3)
+    assert (config.noise.lidar_ground_tilt_deg, said) == (None, ())
 
 
 def test_without_a_height_grass_tilts_alone() -> None:

@@ -36,7 +36,7 @@ LAYOUT = Layout(
     jitters=2,
     rates=RATES,
     bent=True,
-    ground_tilts=6,
+    ground_frames=2,
 )
 LIDAR = np.array([0, 1, 1, 0])
 POSE = np.array([0, 0, 1, 1])
@@ -51,9 +51,10 @@ def state_of(rng: np.random.Generator) -> State:
     normals = rng.standard_normal((3, 3))
     normals[0] = [0.05, -0.1, 1.0]  # ground
     errors = np.zeros(LAYOUT.size)
-    drawn = 0.01 * rng.standard_normal(LAYOUT.size - LAYOUT.error - LAYOUT.ground_tilts)
-    tilts_rad = np.linspace(-1e-3, 1e-3, LAYOUT.ground_tilts)
-    errors[LAYOUT.error :] = np.insert(drawn, LAYOUT.ground_tilt - LAYOUT.error, tilts_rad)
+    of_frames = LAYOUT.standing - LAYOUT.ground_frame
+    drawn = 0.01 * rng.standard_normal(LAYOUT.size - LAYOUT.error - of_frames)
+    frames = np.linspace(-1e-3, 1e-3, of_frames)
+    errors[LAYOUT.error :] = np.insert(drawn, LAYOUT.ground_frame - LAYOUT.error, frames)
     errors[LAYOUT.jitter : LAYOUT.plane] *= 0.1  # milliseconds
     errors[LAYOUT.plane : LAYOUT.bend] = 0.0
     return State(
@@ -122,7 +123,7 @@ def world() -> tuple[State, Sightings, np.ndarray, np.ndarray]:
         (LAYOUT.offset, 1),
         (LAYOUT.extrinsic, 12),
         (LAYOUT.error, 6),
-        (LAYOUT.ground_tilt, 6),
+        (LAYOUT.ground_frame, 8),
         (LAYOUT.jitter, 2),
         (LAYOUT.plane, LAYOUT.size - LAYOUT.plane),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -50,7 +51,8 @@ RAISED_M, GUESS_SIGMAS = 0.5, 3.0
 perhaps the vehicle's roof."""
 
 FEWEST_JUDGED = 8
-"""Scans of a LiDAR with ground that is a plane or bent, to say how often it is bent."""
+"""Scans of a LiDAR with ground that is a plane or bent, to say how often it is bent; of those with
+a plane, to say how rough it is."""
 
 
 class GroundMeter:
@@ -156,6 +158,7 @@ class GroundMeter:
             taken_s=(float(times_s.min()), float(times_s.max())),
             twist_map=turned_twist(R_map_vehicle, twist),
             R_map_vehicle=R_map_vehicle,
+            roughness_m=plane.roughness_m,
         )
 
     def _is_roof(self, scan: LidarScan, plane: GroundPlane) -> bool:
@@ -230,6 +233,20 @@ def nearest_scans(
         if apart <= MAX_APART_NS and (scan_ns not in out or apart < abs(scan_ns - out[scan_ns])):
             out[scan_ns] = pose_ns
     return out
+
+
+def roughness_m(observations: Sequence[GroundObservation], drive: int) -> float | None:
+    """Scatter of the ground of a drive from point to point, 1 sigma, beside the noise of LiDARs.
+
+    That of the LiDAR that sees the least of it: an error of its own is none of the ground. None: no
+    LiDAR sees it in enough scans.
+    """
+    seen: dict[str, list[float]] = {}
+    for o in observations:
+        if o.drive == drive and not math.isnan(o.roughness_m):
+            seen.setdefault(o.lidar, []).append(o.roughness_m)
+    found = [float(np.median(of)) for of in seen.values() if len(of) >= FEWEST_JUDGED]
+    return min(found, default=None)
 
 
 def measure_grounds(

@@ -31,6 +31,9 @@ CELL_POINTS = 10
 """A square metre contributes at most `CELL_POINTS` points. Else the dense rings next to the
 vehicle, or its own roof, would outweigh the ground."""
 
+LEAST_CELLS = 8
+"""Square metres with half as many points at least, to say how rough the ground is."""
+
 MAX_POINTS = 12_000
 """Points used at most: more do not improve the plane."""
 
@@ -117,6 +120,8 @@ class GroundPlane:
         points: number of points on it.
         scatter_m: root mean square height of these points about it.
         radius_m: of the surroundings that were fitted.
+        roughness_m: scatter of the heights within a square metre, 1 sigma, beside the noise of the
+            ranges; nan: too few square metres have enough points.
     """
 
     normal_lidar: Array
@@ -129,6 +134,7 @@ class GroundPlane:
     points: int
     scatter_m: float
     radius_m: float
+    roughness_m: float = math.nan
 
     def cov_with(self, floors: Array) -> Array:
         """(3, 3) covariance as the ground under the wheels: `cov`, the floors (3,), and `beyond`.
@@ -337,8 +343,31 @@ def _judged(
         points=count,
         scatter_m=float(np.sqrt(np.average(height**2, weights=weight))),
         radius_m=radius_m,
+        roughness_m=_roughness_m(fit, standing, beams @ normal, sigma_range_m),
     )
     return ground, ""
+
+
+def _roughness_m(fit: _Fit, standing: BoolArray, slope: Array, sigma_range_m: float) -> float:
+    """`GroundPlane.roughness_m`: the median over the square metres.
+
+    All points near the plane count, not those on it alone: of grass it is the lower part.
+    """
+    near = fit.usable & ~standing & (np.abs(fit.height) < START_DISTANCE_M)
+    _, cell, number = np.unique(
+        _cells(fit.place[near], CELL_M), return_inverse=True, return_counts=True
+    )
+    enough = number >= CELL_POINTS // 2
+    if np.count_nonzero(enough) < LEAST_CELLS:
+        return math.nan
+    height, free = fit.height[near], number[enough] - 1.0
+    off = height - (np.bincount(cell, height) / number)[cell]
+    squares = np.bincount(
+        cell, off**2 - (sigma_range_m * slope[near]) ** 2 * (1.0 - 1.0 / number[cell])
+    )
+    # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
+    variance = squares[enough] / free / (1.0 - 2.0 / (9.0 * free)) ** 3
+    return math.sqrt(max(float(np.median(variance)), 0.0))
 
 
 def _is_determined(cov: Array) -> bool:

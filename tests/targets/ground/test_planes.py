@@ -212,6 +212,24 @@ def test_grass_is_not_the_ground() -> None:
     assert abs(np.mean(off, axis=0)[2]) < DISTANCE_FLOOR_M / 2.0
 
 
+@pytest.mark.parametrize("sigma_m", [0.003, 0.01])
+@pytest.mark.parametrize("mean_m", [0.0, 0.02, 0.035])
+def test_roughness_is_that_of_the_ground_not_of_the_ranges(mean_m: float, sigma_m: float) -> None:
+    """Blades of all lengths return flat beams far before the soil; heights scatter by 0.5 to 0.7
+    of the mean, also on a gentle slope and beside things that stand on it."""
+    scan = scan_of(level, wall(10.0, 2.0), sigma_m=sigma_m, seed=3)
+    low = scan.points_lidar @ UP_LIDAR < -HEIGHT_M + 0.2
+    lift = low * mean_m * np.random.default_rng(3).gamma(2.0, 0.5, len(low))
+    points = scan.points_lidar * (1.0 - lift / HEIGHT_M)[:, None]
+    plane = measured(replace(scan, points_lidar=points), sigma_m=0.01)
+    assert 0.45 * mean_m - 0.002 < plane.roughness_m < 0.75 * mean_m + 0.002
+
+
+def test_few_square_metres_do_not_tell_the_roughness() -> None:
+    scan = scan_of(level, sigma_m=0.01, directions=beams(30, 13))
+    assert math.isnan(measured(scan).roughness_m)
+
+
 def test_scattered_returns_do_not_matter() -> None:
     scan = scan_of(level, sigma_m=0.01, seed=7)
     rng = np.random.default_rng(0)

@@ -42,6 +42,7 @@ from caliv_graph.uncertainty.consistency import (
     CloudCount,
     CoarseRegistrations,
     Contradiction,
+    Creeping,
     GuessContradiction,
     GuessesTogether,
     RangesDisagree,
@@ -72,6 +73,16 @@ def _headings(
             if disagreement is not None:
                 out[index] = disagreement
     return out
+
+
+def _creeping(solution: Solution) -> Creeping | None:
+    """The joint loop of a solution, if it ended far from where it leads."""
+    if not solution.creeps:
+        return None
+    last = solution.course[-1]
+    seeing = {c.lidar for r in solution.registrations for c in r.observation.clouds}
+    lidars = tuple(name for name in solution.lidars if name in seeing)
+    return Creeping(len(solution.course), last.turn_rad, last.shift_m, last.sigmas, lidars)
 
 
 def check(
@@ -124,6 +135,7 @@ def check(
             ],
             speed_m_s=typical_speed(solution, trajectories),
             strains=strains(solution, drives),
+            creeping=_creeping(solution),
         )
     )
     calibration = replace(calibration, suspects=suspects)
@@ -176,7 +188,7 @@ def _about(found: Contradiction) -> tuple[str, ...]:
             return (found.lidar, other)
         case GuessContradiction() | CloudCount() | ScoreTest():
             return (found.lidar,)
-        case CoarseRegistrations() | RangesDisagree() | GuessesTogether():
+        case CoarseRegistrations() | Creeping() | RangesDisagree() | GuessesTogether():
             return found.lidars
         case _:
             return ()

@@ -84,6 +84,15 @@ STEP_SIGMAS = 0.1
 the accuracy of 100 clouds of a chair. Or else in joint standard deviations of the extrinsics."""
 
 
+CREEPING_SIGMAS, LAST_STEPS = 0.5, 5
+"""A step of as many joint standard deviations among so many last ones: the loop is far from its
+end, although its iterations are up. Two copies of an edge, a hand's breadth apart, one of each
+LiDAR, draw each other together by a millimetre in each at the noise level."""
+
+MOST_ROUNDS = 8
+"""Rounds of iterations of such a loop at most: shapes that begin anew are coarse at first, and move
+by centimetres. `random` 194 of the second simulator, 0.35 m off at first, takes three."""
+
 FEW_SURFELS, OTHER_STARTS = 100, 2
 """Where a target has fewer surfels, for want of points, the shapes begin so many times more, on
 other points, and the mean of all ends is taken. Where the surface is cut into them moves the
@@ -99,6 +108,11 @@ def further_refinements(sigma_range_m: float) -> int:
     """How many iterations each other start may take, at this noise along the beam (metres)."""
     annealed = annealing_steps(FINE_SIGMA_M, sigma_range_m)
     return annealed + TILES_SETTLE + LAST_REFINEMENTS
+
+
+def creeps(course: Sequence[Iteration]) -> bool:
+    """Whether iterations that did not converge ended far from where they lead."""
+    return any(last.sigmas > CREEPING_SIGMAS for last in course[-LAST_STEPS:])
 
 
 def refined(
@@ -117,7 +131,9 @@ def refined(
     """
     loop, course, converged = _settled(state, states, most, advance)
     return replace(
-        _refined_solution(loop, course[-1], len(course), converged), course=tuple(course)
+        _refined_solution(loop, course[-1], len(course), converged),
+        course=tuple(course),
+        creeps=loop.creeps,
     )
 
 
@@ -199,27 +215,44 @@ def _settled(
     sizes = channel_sizes(channels.lidars, found, range_errors(state.config.noise))
     base, prior = base_graph(state), state.problem.guess_information()
     loop = _Loop(state, states, base, prior, none_m, channels, sizes)
-    loop.begin_shapes()
     course: list[Iteration] = []
-    converged = False
-    while len(course) < most and not converged:
-        course.append(loop.iterate(len(course) + 1))
-        converged = loop.has_converged(course[-1])
-        advance()
+    converged = _in_rounds(loop, course, most, advance)
+    loop.creeps = not converged and creeps(course)
     few = min(FEW_SURFELS, state.config.registration.components)
-    if any(len(shape.mixture.weights) < few for shape in states):
+    if not loop.creeps and any(len(shape.mixture.weights) < few for shape in states):
         ends = [loop.extrinsics()]
         further = further_refinements(state.config.noise.lidar_range_m)
         for draw in range(1, OTHER_STARTS + 1):
             loop.begin_shapes(draw)
-            for _ in range(further):
-                course.append(loop.iterate(len(course) + 1))
-                advance()
-                if loop.has_converged(course[-1]):
-                    break
+            _iterated(loop, course, further, advance)
             ends.append(loop.extrinsics())
         loop.move_to_mean(ends)
     return loop, course, converged
+
+
+def _in_rounds(
+    loop: _Loop, course: list[Iteration], most: int, advance: Callable[..., None]
+) -> bool:
+    """Whether the loop has converged in rounds of `most` iterations, one unless it creeps."""
+    for _ in range(MOST_ROUNDS):
+        loop.begin_shapes()
+        if _iterated(loop, course, most, advance):
+            return True
+        if not creeps(course):
+            break
+    return False
+
+
+def _iterated(
+    loop: _Loop, course: list[Iteration], most: int, advance: Callable[..., None]
+) -> bool:
+    """Whether the loop has converged within `most` more iterations, which `course` gets."""
+    for _ in range(most):
+        course.append(loop.iterate(len(course) + 1))
+        advance()
+        if loop.has_converged(course[-1]):
+            return True
+    return False
 
 
 @dataclass
@@ -229,7 +262,8 @@ class _Loop:
     `prior` (6n, 6n) of the guesses; `offsets_m` (B,): biases of the ranges with which
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
     once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement since the
-    shapes began; `channels` that see the targets, and sizes of their errors.
+    shapes began; `channels` that see the targets, and sizes of their errors; whether it ended
+    far from where it leads (`creeps`).
     """
 
     state: SolveState
@@ -242,6 +276,7 @@ class _Loop:
     undetermined: int | None = None
     fine: int = 0
     ranges: tuple[OwnRanges, ...] = ()
+    creeps: bool = False
 
     def expected(self) -> tuple[_Shapes, CloudLinearisation]:
         """E-step at the poses that the graph predicts, and the derivatives of these."""

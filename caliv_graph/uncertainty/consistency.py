@@ -241,6 +241,7 @@ class CheckInputs:
         headings: of the drives that have one.
         speed_m_s: median over the clouds.
         strains: of the drives with a smoothed trajectory.
+        creeping: the joint loop, if it ended far from where it leads.
     """
 
     lidars: Mapping[str, LidarResult]
@@ -253,6 +254,7 @@ class CheckInputs:
     headings: Sequence[Heading] = ()
     speed_m_s: float = 0.0
     strains: Sequence[Strain] = ()
+    creeping: Creeping | None = None
 
 
 @dataclass(frozen=True)
@@ -333,6 +335,25 @@ class CoarseRegistrations:
 
 
 @dataclass(frozen=True)
+class Creeping:
+    """A joint loop whose iterations ended far from where they lead.
+
+    Attributes:
+        iterations: how many there were.
+        turn_rad: largest step of a LiDAR in the last of them.
+        shift_m: likewise.
+        sigmas: of all steps of the last of them, in joint standard deviations.
+        lidars: that see a target.
+    """
+
+    iterations: int
+    turn_rad: float
+    shift_m: float
+    sigmas: float
+    lidars: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class RangesDisagree:
     """Ranges of LiDARs on several targets that no mounting brings together.
 
@@ -350,6 +371,7 @@ Contradiction = (
     | GuessesTogether
     | CloudCount
     | CoarseRegistrations
+    | Creeping
     | RangesDisagree
     | ScoreTest
     | Assumed
@@ -369,6 +391,7 @@ def contradictions(inputs: CheckInputs) -> tuple[Contradiction, ...]:
         *guesses,
         *(count for count in inputs.counts if too_many_outliers(count)),
         *coarse_registrations(inputs),
+        *([] if inputs.creeping is None else [inputs.creeping]),
         *disagreeing_ranges(inputs),
         *(test for test in inputs.score_tests if p_value(test) < CONTRADICTION_P),
         *(each for each in inputs.assumed if assumption_contradicted(each)),

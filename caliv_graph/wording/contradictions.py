@@ -22,6 +22,7 @@ from caliv_graph.uncertainty.consistency import (
     CloudCount,
     CoarseRegistrations,
     Contradiction,
+    Creeping,
     GuessContradiction,
     GuessesTogether,
     Heading,
@@ -72,6 +73,8 @@ def contradiction_sentence(
             )
         case CoarseRegistrations():
             return _coarse(found, led)
+        case Creeping():
+            return _creeping(found, led)
         case RangesDisagree():
             return _ranges(found, led)
         case ScoreTest():
@@ -82,6 +85,19 @@ def contradiction_sentence(
             return _heading(found)
         case Strain():
             return _strain(found, led)
+
+
+def _creeping(found: Creeping, led: bool) -> str:
+    advice = (
+        ". Give better initial guesses (lidars.<name>.initial), a target with edges that all "
+        "LiDARs see, or structure around it"
+    )
+    return (
+        f"the registration has not come to rest: in the last of {found.iterations} iterations "
+        f"LiDARs still moved by {1e3 * found.turn_rad:.2f} mrad and {1e3 * found.shift_m:.1f} mm "
+        f"({found.sigmas:.1f} sigma); they may be off by many of their sigmas"
+        f"{'' if led else advice}"
+    )
 
 
 def _strain(found: Strain, led: bool) -> str:

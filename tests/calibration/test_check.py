@@ -11,13 +11,20 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration import check as checks
-from caliv_graph.calibration.check import strains, unexplained
+from caliv_graph.calibration.check import _creeping, strains, unexplained
 from caliv_graph.calibration.graph import CalibrationGraph
 from caliv_graph.calibration.vehicle_parameters import KEYS
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES, key_vehicle
 from caliv_graph.geometry.chart import PoseChart
-from caliv_graph.products import Calibration, LidarResult, Solution, Suspect, VehicleParameter
+from caliv_graph.products import (
+    Calibration,
+    Iteration,
+    LidarResult,
+    Solution,
+    Suspect,
+    VehicleParameter,
+)
 from caliv_graph.trajectory.factors import Gaussian
 from caliv_graph.trajectory.parameters import LEVER_ARM
 from caliv_graph.uncertainty import consistency
@@ -25,6 +32,7 @@ from caliv_graph.uncertainty.consistency import (
     CloudCount,
     CoarseRegistrations,
     Contradiction,
+    Creeping,
     GuessesTogether,
     Heading,
     Strain,
@@ -147,6 +155,26 @@ def test_the_lidars_that_contradictions_are_about_are_given_by_name(
     found[:] = [CoarseRegistrations(9.0, (0.01, 0.1), ("left", "right"), None)]
     _, _, concerned = checked(calibration, monkeypatch)
     assert concerned == ("left", "right")
+    found[:] = [Creeping(240, 1e-3, 0.002, 1.4, ("left",))]
+    _, _, concerned = checked(calibration, monkeypatch)
+    assert concerned == ("left",)
+
+
+@pytest.mark.parametrize("creeps", [False, True])
+def test_a_loop_that_ended_on_its_way_is_a_contradiction_of_the_lidars_that_see_a_target(
+    creeps: bool,
+) -> None:
+    seen = SimpleNamespace(observation=SimpleNamespace(clouds=[SimpleNamespace(lidar="left")]))
+    solution = SimpleNamespace(
+        creeps=creeps,
+        course=(Iteration(1e-3, 0.01, 3.0, 0.0), Iteration(2e-4, 0.0017, 1.4, 0.0)),
+        registrations=(seen,),
+        lidars=("roof", "left"),
+    )
+    found = _creeping(cast("Solution", solution))
+    assert found == (Creeping(2, 2e-4, 0.0017, 1.4, ("left",)) if creeps else None)
+    said = consistency.contradictions(consistency.CheckInputs(lidars={}, creeping=found))
+    assert said == (() if found is None else (found,))
 
 
 def nothing_calibrated() -> Calibration:
@@ -173,6 +201,8 @@ def checked(
     }
     for name, value in (found | of).items():
         monkeypatch.setattr(checks, name, lambda *_, value=value: value)
-    solution = cast("Solution", SimpleNamespace(registration_scale=1.0, range_bias_m=0.0))
+    solution = cast(
+        "Solution", SimpleNamespace(registration_scale=1.0, range_bias_m=0.0, creeps=False)
+    )
     config = cast("Config", None)  # of the suspects
     return checks.check(calibration, solution, [], [], {}, config)

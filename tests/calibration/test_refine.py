@@ -1,15 +1,24 @@
-"""What the clouds alone say of their poses, for pose factors."""
+"""What the clouds alone say of their poses, for pose factors; when the joint loop ends."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
+from typing import cast
 
 import gtsam
 import numpy as np
+import pytest
 
-from caliv_graph.calibration.refine import poses_by_clouds_alone
+from caliv_graph.calibration.refine import (
+    MOST_ROUNDS,
+    _in_rounds,
+    _Loop,
+    creeps,
+    poses_by_clouds_alone,
+)
 from caliv_graph.geometry.se3 import unstack
-from caliv_graph.products import Array
+from caliv_graph.products import Array, Iteration
 from caliv_graph.registration.quadratic import ShapeQuadratic
 from caliv_graph.registration.register import JointRegistration, left_step
 from tests.registration.scenes import chair_scene, config_of, matrices
@@ -67,3 +76,47 @@ def test_robust_weights_are_taken_out_of_a_clouds_own_information() -> None:
     assert 0.5 < noise < 1.5
     atol = 0.03 * np.abs(full[3]).max()
     np.testing.assert_allclose(blocks[3] / noise, full[3], rtol=0.1, atol=atol)
+
+
+class Rounds:
+    """A loop whose steps (sigmas) are given, and that has converged at a step of 0.05."""
+
+    def __init__(self, sigmas: Sequence[float]) -> None:
+        self.sigmas, self.begun, self.iterated = sigmas, 0, 0
+
+    def begin_shapes(self) -> None:
+        self.begun += 1
+
+    def iterate(self, number: int) -> Iteration:
+        assert number == self.iterated + 1  # goes on from round to round
+        self.iterated = number
+        return Iteration(1e-4, 1e-3, self.sigmas[min(number, len(self.sigmas)) - 1], 0.0)
+
+    def has_converged(self, last: Iteration) -> bool:
+        return last.sigmas <= 0.05
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "rounds", "iterations", "converged"),
+    [
+        ([3.0, 1.0, 0.05], 1, 3, True),
+        ([2.0] * 10 + [0.4], 1, 20, False),
+        ([2.0] * 45 + [0.05], 3, 46, True),
+        ([2.0] * 16 + [0.4] * 100, 2, 40, False),
+        ([1.0], MOST_ROUNDS, 20 * MOST_ROUNDS, False),
+    ],
+    ids=["converges", "wanders a little", "creeps and converges", "creeps less", "creeps on"],
+)
+def test_a_loop_that_creeps_begins_its_shapes_anew(
+    sigmas: Sequence[float], rounds: int, iterations: int, converged: bool
+) -> None:
+    loop, course = Rounds(sigmas), list[Iteration]()
+    told = []
+    found = _in_rounds(cast("_Loop", loop), course, 20, lambda: told.append(1))
+    assert (found, loop.begun, len(course)) == (converged, rounds, iterations)
+    assert len(told) == iterations
+    assert (not found and creeps(course)) == (sigmas[-1] > 0.5)
+
+
+def test_nothing_creeps_before_the_first_iteration() -> None:
+    assert not creeps([])

@@ -2,13 +2,15 @@
 
 With its guess, a LiDAR's ground must be level in vehicle axes and lie `ground.vehicle_height` below
 the vehicle frame. All guesses are tested together: what is common to the LiDARs is the vehicle's,
-what one has alone is its guess's.
+what one has alone is its guess's. How far the scans differ is the terrain's, which all LiDARs see.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -19,6 +21,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, IntArray, LidarScan, Recording
 from caliv_graph.targets.ground.measure import GroundMeter
+from caliv_graph.targets.ground.planes import MEDIAN_OF_NORMAL
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.tilt import body_sigma_rad
 
@@ -30,6 +33,9 @@ MIN_SCANS = 3
 
 HEIGHT_FLOOR_M = 0.01
 """1 sigma of the height of a LiDAR by these scans: heave, unevenness, a rise of the ground."""
+
+MEDIAN_OVER_MEAN = 1.2533
+"""Sigma of the median over that of the mean, of normal values: sqrt(pi / 2)."""
 
 Quantity = Literal["height", "roll", "pitch"]
 
@@ -43,12 +49,16 @@ class LidarGround:
         height_m: of the LiDAR above the ground, median of the scans.
         roll_pitch_rad: (2,) of the guess against the ground, median of the scans.
         scans: with ground.
+        height_sigma_m: of the height, by how it differs from scan to scan.
+        roll_pitch_sigma_rad: (2,) likewise.
     """
 
     lidar: str
     height_m: float
     roll_pitch_rad: Array
     scans: int
+    height_sigma_m: float = 0.0
+    roll_pitch_sigma_rad: Array = field(default_factory=partial(np.zeros, 2))
 
 
 @dataclass(frozen=True)
@@ -121,7 +131,20 @@ def _of_lidar(
             tilts.append([-y, x])
     if len(heights) < MIN_SCANS:
         return None
-    return LidarGround(name, float(np.median(heights)), np.median(tilts, axis=0), len(heights))
+    return LidarGround(
+        name,
+        float(np.median(heights)),
+        np.median(tilts, axis=0),
+        len(heights),
+        float(_sigma_of_median(np.array(heights))),
+        _sigma_of_median(np.array(tilts)),
+    )
+
+
+def _sigma_of_median(values: Array) -> Array:
+    """1 sigma of the median of values (n, ...) along the first axis, by their own spread."""
+    spread = np.median(np.abs(values - np.median(values, axis=0)), axis=0) / MEDIAN_OF_NORMAL
+    return np.asarray(MEDIAN_OVER_MEAN * spread / math.sqrt(len(values)))
 
 
 def _plane(meter: GroundMeter, scan: LidarScan) -> tuple[Array, float] | None:
@@ -142,7 +165,9 @@ def misfits(grounds: Sequence[LidarGround], config: Config) -> tuple[Misfit, ...
             off = np.array([g.roll_pitch_rad[axis] for g in grounds])
             own = np.array([config.lidars[g.lidar].sigma.sigmas()[axis] for g in grounds])
             names = [g.lidar for g in grounds]
-            out.append(_strongest(quantity, names, -off, np.diag(own**2), body_sigma_rad(config)))
+            terrain = np.median([g.roll_pitch_sigma_rad[axis] for g in grounds])
+            common = math.hypot(body_sigma_rad(config), float(terrain))
+            out.append(_strongest(quantity, names, -off, np.diag(own**2), common))
     if grounds and config.ground.vehicle_height is not None:
         out.append(_height(grounds, config, config.ground.vehicle_height))
     return tuple(out)
@@ -158,7 +183,9 @@ def _height(grounds: Sequence[LidarGround], config: Config, vehicle_height: floa
         body_sigma_rad(config) * places[:, :2]
     )  # the body's tilt lifts what is far from the origin
     cov = np.diag(own**2 + HEIGHT_FLOOR_M**2) + lever @ lever.T
-    return _strongest("height", [g.lidar for g in grounds], off, cov, config.ground.sigma)
+    terrain_m = float(np.median([g.height_sigma_m for g in grounds]))
+    common_m = math.hypot(config.ground.sigma, terrain_m)
+    return _strongest("height", [g.lidar for g in grounds], off, cov, common_m)
 
 
 def _strongest(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,13 @@ import pytest
 
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
-from caliv_graph.targets.ground.guesses import HEIGHT_FLOOR_M, LidarGround, Misfit, misfits
+from caliv_graph.targets.ground.guesses import (
+    HEIGHT_FLOOR_M,
+    LidarGround,
+    Misfit,
+    _sigma_of_median,
+    misfits,
+)
 from caliv_graph.wording.physics import guess_findings
 
 SIGMA_M, GROUND_M = 0.058, 0.005
@@ -67,6 +74,27 @@ def test_what_one_lidar_has_alone_is_its_guess() -> None:
     (finding,) = guess_findings("drive", misfits(grounds, guessed), guessed)
     assert finding.input == "lidars.left.initial.xyz"
     assert finding.value == pytest.approx((1.4,), abs=0.01)
+
+
+def test_heights_and_tilts_that_differ_from_scan_to_scan_are_the_terrains() -> None:
+    """Eight scans of hills: the median of their heights is no better than their spread allows."""
+    guessed = config({"front": 2.0, "rear": 1.5})
+    level = [seen("front", 2.8, 5.0), seen("rear", 2.3, 5.0)]
+    hilly = [
+        replace(g, height_sigma_m=0.4, roll_pitch_sigma_rad=np.radians([10.0, 10.0])) for g in level
+    ]
+    for quantity, sigma in (("height", 0.4), ("roll", math.radians(10.0))):
+        sure, unsure = (of(quantity, misfits(grounds, guessed)) for grounds in (level, hilly))
+        assert unsure.sigma == pytest.approx(math.hypot(sure.sigma, sigma), rel=1e-6)
+    assert of("height", misfits(level, guessed)).sigmas > 5.0
+    assert guess_findings("drive", misfits(hilly, guessed), guessed) == ()
+
+
+def test_the_spread_of_scans_tells_how_well_their_median_is_known() -> None:
+    rng = np.random.default_rng(4)
+    sigmas = [_sigma_of_median(rng.normal(0.0, [0.1, 0.02], (8, 2))) for _ in range(400)]
+    medians = [np.median(rng.normal(0.0, [0.1, 0.02], (8, 2)), axis=0) for _ in range(400)]
+    assert np.mean(sigmas, axis=0) == pytest.approx(np.std(medians, axis=0), rel=0.15)
 
 
 def test_guesses_that_are_inverse_are_said_beside_the_height() -> None:

@@ -27,7 +27,7 @@ def tiny_drive(folder: Path, seed: int) -> Path:
     document |= {
         "extraction": {"min_points": 20, "min_scans": 4},
         "ground": {"use": False},
-        "registration": {"components": 40, "max_iterations": 24, "max_points": 60},
+        "registration": {"components": 100, "max_iterations": 24, "max_points": 150},
         "require": [],
         "solve": {"mode": "staged"},
     }

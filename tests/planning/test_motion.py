@@ -261,10 +261,11 @@ def test_grounds_information_is_that_of_numerical_derivatives() -> None:
         T = X.compose(E)
         rises = ground_by_range_bias(scan.scenario.lidars["front"])
         rises = rises @ d[6 + columns.all_biases[:3]]
-        seen_turned = gtsam.Rot3.Expmap(d[6 + columns.all_biases[3:]])
+        seen_turned = gtsam.Rot3.Expmap(d[6 + columns.all_biases[3:6]])
+        (seen_higher,) = d[6 + columns.all_biases[6:]]
         R = X.rotation().compose(seen_turned).compose(E.rotation()).matrix()
         normal_seen = normal + X.rotation().matrix()[:, :2] @ rises[:2]
-        over = normal @ (T.translation() - foot) + rises[2]
+        over = normal @ (T.translation() - foot) + rises[2] + seen_higher
         stands = normal @ (X.translation() - foot) - error
         return np.concatenate(
             [

@@ -373,6 +373,7 @@ def _solved(
     if config.solve.mode == "staged":
         with progress.stage("solving the graph in two stages", None):
             solution = replace(staged_solution(solve, registrations), course=course)
+    solution = replace(solution, creeps=solve.creeps)
     spent = time.perf_counter() - begun - solve.graph_seconds
     times["refinement"] = times.get("refinement", 0.0) + spent
     times["graph"] += solve.graph_seconds

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
@@ -131,9 +131,7 @@ def refined(
     """
     loop, course, converged = _settled(state, states, most, advance)
     return replace(
-        _refined_solution(loop, course[-1], len(course), converged),
-        course=tuple(course),
-        creeps=loop.creeps,
+        _refined_solution(loop, course[-1], len(course), converged), course=tuple(course)
     )
 
 
@@ -150,8 +148,8 @@ def registered_with_motion(
     is the M-step here, too.
 
     Args:
-        state: of `solve_registered`; gets values, weights, the scale of the registration, and what
-            biases of the ranges do to the poses.
+        state: of `solve_registered`; gets values, weights, the scale of the registration, what
+            biases of the ranges do to the poses, and whether the loop creeps.
         states: the registration of each placement, taken along.
         most: iterations of the first start.
         advance: is called after each.
@@ -217,9 +215,9 @@ def _settled(
     loop = _Loop(state, states, base, prior, none_m, channels, sizes)
     course: list[Iteration] = []
     converged = _in_rounds(loop, course, most, advance)
-    loop.creeps = not converged and creeps(course)
+    state.creeps = not converged and creeps(course)
     few = min(FEW_SURFELS, state.config.registration.components)
-    if not loop.creeps and any(len(shape.mixture.weights) < few for shape in states):
+    if not state.creeps and any(len(shape.mixture.weights) < few for shape in states):
         ends = [loop.extrinsics()]
         further = further_refinements(state.config.noise.lidar_range_m)
         for draw in range(1, OTHER_STARTS + 1):
@@ -234,9 +232,11 @@ def _in_rounds(
     loop: _Loop, course: list[Iteration], most: int, advance: Callable[..., None]
 ) -> bool:
     """Whether the loop has converged in rounds of `most` iterations, one unless it creeps."""
-    for _ in range(MOST_ROUNDS):
+    for number in range(1, MOST_ROUNDS + 1):
         loop.begin_shapes()
-        if _iterated(loop, course, most, advance):
+        # Further rounds are not among the iterations that were expected.
+        further = partial(advance, 0, f"round {number}")
+        if _iterated(loop, course, most, further if number > 1 else advance):
             return True
         if not creeps(course):
             break
@@ -262,8 +262,7 @@ class _Loop:
     `prior` (6n, 6n) of the guesses; `offsets_m` (B,): biases of the ranges with which
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
     once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement since the
-    shapes began; `channels` that see the targets, and sizes of their errors; whether it ended
-    far from where it leads (`creeps`).
+    shapes began; `channels` that see the targets, and sizes of their errors.
     """
 
     state: SolveState
@@ -276,7 +275,6 @@ class _Loop:
     undetermined: int | None = None
     fine: int = 0
     ranges: tuple[OwnRanges, ...] = ()
-    creeps: bool = False
 
     def expected(self) -> tuple[_Shapes, CloudLinearisation]:
         """E-step at the poses that the graph predicts, and the derivatives of these."""

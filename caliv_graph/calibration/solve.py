@@ -108,6 +108,8 @@ class SolveState:
     """(6 J, B) how the poses of registered clouds seem to move by biases of sigma 1; None: none."""
     least_scale: float = 0.0
     """What `scale` is at least after the joint loop: 1, or what a jackknife said."""
+    creeps: bool = False
+    """Whether the joint loop ended far from where it leads."""
     structure: tuple[StructureTerm, ...] = ()
     structure_factors: CalibrationGraph = field(default_factory=CalibrationGraph)
     """Of `structure`; like those of `motion` they take time to build."""

@@ -111,10 +111,15 @@ def test_a_loop_that_creeps_begins_its_shapes_anew(
     sigmas: Sequence[float], rounds: int, iterations: int, converged: bool
 ) -> None:
     loop, course = Rounds(sigmas), list[Iteration]()
-    told = []
-    found = _in_rounds(cast("_Loop", loop), course, 20, lambda: told.append(1))
+    told = list[tuple[int, str]]()
+
+    def advance(n: int = 1, note: str = "") -> None:
+        told.append((n, note))
+
+    found = _in_rounds(cast("_Loop", loop), course, 20, advance)
     assert (found, loop.begun, len(course)) == (converged, rounds, iterations)
-    assert len(told) == iterations
+    assert told[:20] == [(1, "")] * min(iterations, 20)
+    assert told[20:] == [(0, f"round {2 + k // 20}") for k in range(iterations - 20)]
     assert (not found and creeps(course)) == (sigmas[-1] > 0.5)
 
 

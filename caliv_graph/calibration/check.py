@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.graph import CalibrationGraph
+from caliv_graph.calibration.refine import LAST_STEPS
 from caliv_graph.calibration.robust import FAR_OFF
 from caliv_graph.calibration.score_tests import MIN_YAW_RATE_RAD_S, score_tests
 from caliv_graph.calibration.suspect_values import ranked_suspects
@@ -79,7 +80,7 @@ def _creeping(solution: Solution) -> Creeping | None:
     """The joint loop of a solution, if it ended far from where it leads."""
     if not solution.creeps:
         return None
-    last = solution.course[-1]
+    last = max(solution.course[-LAST_STEPS:], key=lambda step: step.sigmas)
     seeing = {c.lidar for r in solution.registrations for c in r.observation.clouds}
     lidars = tuple(name for name in solution.lidars if name in seeing)
     return Creeping(len(solution.course), last.turn_rad, last.shift_m, last.sigmas, lidars)

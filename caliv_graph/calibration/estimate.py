@@ -209,7 +209,8 @@ def _estimate(
         rough = replace(rough, offsets_s=solved.offsets_s)
     said = (line for term in solved.state.structure for line in term.warnings)
     solution = solved.solution
-    unconverged = _unconverged(solution.registrations)
+    # A loop that creeps is a contradiction, with a sentence of its own.
+    unconverged = [] if solution.creeps else _unconverged(solution.registrations)
     warnings = (*rough.warnings, *solved.alike, *said, *unconverged, *left)
     levels = whole.noise.levels
     solution = replace(solution, stage_times_s=times, warnings=warnings, sensor_noise=levels)

@@ -23,6 +23,7 @@ from caliv_graph.calibration.noise import fit_scale, squares_without_own_pose
 from caliv_graph.calibration.pack import packed_solution
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.range_bias import (
+    UNKNOWN,
     BiasSizes,
     OwnRanges,
     RangeBiases,
@@ -57,8 +58,8 @@ from caliv_graph.registration.symmetry import Symmetry, marginalise_symmetry, re
 from caliv_graph.uncertainty.consistency import RANGE_BIAS_LIMIT_M
 
 REFINEMENTS = 30
-"""Iterations of the joint loop at most; more where the noise is so small that annealing to it takes
-more."""
+"""Iterations of a round of the joint loop at most; more where the noise is so small that annealing
+to it takes more."""
 
 HELD_PART = 1e-6
 """Ridge, relative to each cloud's own information, on the poses that minimise the clouds'
@@ -85,9 +86,9 @@ the accuracy of 100 clouds of a chair. Or else in joint standard deviations of t
 
 
 CREEPING_SIGMAS, LAST_STEPS = 0.5, 5
-"""A step of as many joint standard deviations among so many last ones: the loop is far from its
-end, although its iterations are up. Two copies of an edge, a hand's breadth apart, one of each
-LiDAR, draw each other together by a millimetre in each at the noise level."""
+"""Where most of so many last steps are above as many joint standard deviations, the loop is far
+from its end, although its iterations are up. Two copies of an edge, a hand's breadth apart, one of
+each LiDAR, draw each other together by a millimetre in each at the noise level."""
 
 MOST_ROUNDS = 8
 """Rounds of iterations of such a loop at most: shapes that begin anew are coarse at first, and move
@@ -112,7 +113,13 @@ def further_refinements(sigma_range_m: float) -> int:
 
 def creeps(course: Sequence[Iteration]) -> bool:
     """Whether iterations that did not converge ended far from where they lead."""
-    return any(last.sigmas > CREEPING_SIGMAS for last in course[-LAST_STEPS:])
+    long = [last.sigmas > CREEPING_SIGMAS and not _is_small(last) for last in course[-LAST_STEPS:]]
+    return 2 * sum(long) > len(long)
+
+
+def _is_small(step: Iteration) -> bool:
+    """Whether a step is next to nothing, whatever is known of the extrinsics."""
+    return step.turn_rad < STEP_TOLERANCE[0] and step.shift_m < STEP_TOLERANCE[1]
 
 
 def refined(
@@ -121,7 +128,7 @@ def refined(
     most: int,
     advance: Callable[..., None],
 ) -> Solution:
-    """Expectation-maximisation whose M-step is the graph solve, `most` iterations from one start.
+    """Expectation-maximisation whose M-step is the graph solve, `most` iterations in a round.
 
     `state` (of `solve_registered`) and `states`, the registration of each placement, are taken
     along; `advance` is called after each iteration.
@@ -151,7 +158,7 @@ def registered_with_motion(
         state: of `solve_registered`; gets values, weights, the scale of the registration, what
             biases of the ranges do to the poses, and whether the loop creeps.
         states: the registration of each placement, taken along.
-        most: iterations of the first start.
+        most: iterations of a round.
         advance: is called after each.
 
     Raises:
@@ -233,7 +240,7 @@ def _in_rounds(
 ) -> bool:
     """Whether the loop has converged in rounds of `most` iterations, one unless it creeps."""
     for number in range(1, MOST_ROUNDS + 1):
-        loop.begin_shapes()
+        loop.begin_round()
         # Further rounds are not among the iterations that were expected.
         further = partial(advance, 0, f"round {number}")
         if _iterated(loop, course, most, further if number > 1 else advance):
@@ -247,8 +254,8 @@ def _iterated(
     loop: _Loop, course: list[Iteration], most: int, advance: Callable[..., None]
 ) -> bool:
     """Whether the loop has converged within `most` more iterations, which `course` gets."""
-    for _ in range(most):
-        course.append(loop.iterate(len(course) + 1))
+    for number in range(1, most + 1):
+        course.append(loop.iterate(number))
         advance()
         if loop.has_converged(course[-1]):
             return True
@@ -311,6 +318,13 @@ class _Loop:
             for end in ends
         ]
         self.state.values = self.linearised(*self.expected()).move(np.mean(steps, axis=0))
+
+    def begin_round(self) -> None:
+        """Shapes begin, and all that was found out from those before is forgotten."""
+        self.undetermined, self.fine = None, 0
+        self.offsets_m = np.zeros_like(self.offsets_m)
+        self.state.bias_sizes = UNKNOWN
+        self.begin_shapes()
 
     def begin_shapes(self, draw: int = 0) -> None:
         """New normals and a new mixture, at the poses of the solved graph: EM ends near its start.
@@ -386,7 +400,7 @@ class _Loop:
         self.offsets_m = self._sizes().offset_m * found[: len(self.offsets_m)]
 
     def iterate(self, number: int) -> Iteration:
-        """One iteration: E-step, graph solve, new shape, new weights; counted from 1."""
+        """One iteration: E-step, graph solve, new shape, new weights; the number in its round."""
         state = self.state
         shapes, lines = self.expected()
         begun = time.perf_counter()
@@ -448,11 +462,10 @@ class _Loop:
 
     def has_converged(self, last: Iteration) -> bool:
         """Whether the loop may end after an iteration."""
-        small = last.turn_rad < STEP_TOLERANCE[0] and last.shift_m < STEP_TOLERANCE[1]
         return bool(
             self.fine > BIAS_AFTER
             and all(s.settled for s in self.states)
-            and (small or last.sigmas < STEP_SIGMAS)
+            and (_is_small(last) or last.sigmas < STEP_SIGMAS)
             and last.weight_change < 10.0 * WEIGHT_TOLERANCE
         )
 

@@ -354,13 +354,14 @@ def _on_rough_ground(
     if not ground.use:
         return config, ()
     guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
-    rough, by_drive = {}, {of.drive: of for of in patches}
+    rough: dict[str, float] = {}
+    by_drive = {of.drive: of for of in patches}
     for drive, (recording, trajectory) in enumerate(zip(recordings, trajectories, strict=True)):
         rough_m = roughness_m(grounds, drive)
         if rough_m is None and drive in by_drive:
             rough_m = ground_roughness_m(by_drive[drive], trajectory, guesses)
         if rough_m is not None and rough_m > ROUGH_M:
-            rough[recording.name] = rough_m
+            rough[recording.name] = max(rough_m, rough.get(recording.name, 0.0))
     if not rough:
         return config, ()
     most_m = max(rough.values())

@@ -340,9 +340,9 @@ class Creeping:
 
     Attributes:
         iterations: how many there were.
-        turn_rad: largest step of a LiDAR in the last of them.
+        turn_rad: largest step of a LiDAR in the one of the last that moves most.
         shift_m: likewise.
-        sigmas: of all steps of the last of them, in joint standard deviations.
+        sigmas: of the steps of all LiDARs in it, in joint standard deviations.
         lidars: that see a target.
     """
 

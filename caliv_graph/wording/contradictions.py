@@ -93,10 +93,10 @@ def _creeping(found: Creeping, led: bool) -> str:
         "LiDARs see, or structure around it"
     )
     return (
-        f"the registration has not come to rest: in the last of {found.iterations} iterations "
-        f"LiDARs still moved by {1e3 * found.turn_rad:.2f} mrad and {1e3 * found.shift_m:.1f} mm "
-        f"({found.sigmas:.1f} sigma); they may be off by many of their sigmas"
-        f"{'' if led else advice}"
+        f"the registration has not come to rest: at the end of {found.iterations} iterations "
+        f"LiDARs still moved by up to {1e3 * found.turn_rad:.2f} mrad and "
+        f"{1e3 * found.shift_m:.1f} mm ({found.sigmas:.1f} sigma) in one; they may be off by many "
+        f"of their sigmas{'' if led else advice}"
     )
 
 

@@ -167,12 +167,16 @@ def test_a_loop_that_ended_on_its_way_is_a_contradiction_of_the_lidars_that_see_
     seen = SimpleNamespace(observation=SimpleNamespace(clouds=[SimpleNamespace(lidar="left")]))
     solution = SimpleNamespace(
         creeps=creeps,
-        course=(Iteration(1e-3, 0.01, 3.0, 0.0), Iteration(2e-4, 0.0017, 1.4, 0.0)),
+        course=(
+            Iteration(1e-3, 0.01, 3.0, 0.0),
+            *[Iteration(2e-4, 0.0017, 1.4, 0.0)] * 4,
+            Iteration(1e-4, 1e-3, 0.3, 0.0),
+        ),
         registrations=(seen,),
         lidars=("roof", "left"),
     )
     found = _creeping(cast("Solution", solution))
-    assert found == (Creeping(2, 2e-4, 0.0017, 1.4, ("left",)) if creeps else None)
+    assert found == (Creeping(6, 2e-4, 0.0017, 1.4, ("left",)) if creeps else None)
     said = consistency.contradictions(consistency.CheckInputs(lidars={}, creeping=found))
     assert said == (() if found is None else (found,))
 

@@ -115,10 +115,10 @@ def test_coarse_registrations_name_where_it_shows_most() -> None:
 def test_a_registration_that_has_not_come_to_rest_says_how_it_moves() -> None:
     found = Creeping(240, 2e-4, 0.0017, 1.4, ("front", "rear"))
     assert contradiction_sentence(found) == (
-        "the registration has not come to rest: in the last of 240 iterations LiDARs still moved "
-        "by 0.20 mrad and 1.7 mm (1.4 sigma); they may be off by many of their sigmas. Give better "
-        "initial guesses (lidars.<name>.initial), a target with edges that all LiDARs see, or "
-        "structure around it"
+        "the registration has not come to rest: at the end of 240 iterations LiDARs still moved by "
+        "up to 0.20 mrad and 1.7 mm (1.4 sigma) in one; they may be off by many of their sigmas. "
+        "Give better initial guesses (lidars.<name>.initial), a target with edges that all LiDARs "
+        "see, or structure around it"
     )
     assert contradiction_sentence(found, led=True).endswith("many of their sigmas")
 

@@ -165,9 +165,9 @@ def misfits(grounds: Sequence[LidarGround], config: Config) -> tuple[Misfit, ...
             off = np.array([g.roll_pitch_rad[axis] for g in grounds])
             own = np.array([config.lidars[g.lidar].sigma.sigmas()[axis] for g in grounds])
             names = [g.lidar for g in grounds]
-            terrain = np.median([g.roll_pitch_sigma_rad[axis] for g in grounds])
-            common = math.hypot(body_sigma_rad(config), float(terrain))
-            out.append(_strongest(quantity, names, -off, np.diag(own**2), common))
+            terrain = np.array([g.roll_pitch_sigma_rad[axis] for g in grounds])
+            common = math.hypot(body_sigma_rad(config), float(np.median(terrain)))
+            out.append(_strongest(quantity, names, -off, np.diag(own**2 + terrain**2), common))
     if grounds and config.ground.vehicle_height is not None:
         out.append(_height(grounds, config, config.ground.vehicle_height))
     return tuple(out)
@@ -182,9 +182,10 @@ def _height(grounds: Sequence[LidarGround], config: Config, vehicle_height: floa
     lever = (
         body_sigma_rad(config) * places[:, :2]
     )  # the body's tilt lifts what is far from the origin
-    cov = np.diag(own**2 + HEIGHT_FLOOR_M**2) + lever @ lever.T
-    terrain_m = float(np.median([g.height_sigma_m for g in grounds]))
-    common_m = math.hypot(config.ground.sigma, terrain_m)
+    # Scans of two LiDARs are not quite of the same places.
+    terrain_m = np.array([g.height_sigma_m for g in grounds])
+    cov = np.diag(own**2 + HEIGHT_FLOOR_M**2 + terrain_m**2) + lever @ lever.T
+    common_m = math.hypot(config.ground.sigma, float(np.median(terrain_m)))
     return _strongest("height", [g.lidar for g in grounds], off, cov, common_m)
 
 

@@ -31,8 +31,9 @@ CELL_POINTS = 10
 """A square metre contributes at most `CELL_POINTS` points. Else the dense rings next to the
 vehicle, or its own roof, would outweigh the ground."""
 
-LEAST_CELLS = 8
-"""Square metres with half as many points at least, to say how rough the ground is."""
+CLASSES, LEAST_CELLS = 3, 8
+"""Classes of distance in which the scatter of the ground is compared, and square metres in each
+with half as many points at least."""
 
 MAX_POINTS = 12_000
 """Points used at most: more do not improve the plane."""
@@ -120,8 +121,8 @@ class GroundPlane:
         points: number of points on it.
         scatter_m: root mean square height of these points about it.
         radius_m: of the surroundings that were fitted.
-        roughness_m: scatter of the heights within a square metre, 1 sigma, beside the noise of the
-            ranges; nan: too few square metres have enough points.
+        roughness_m: scatter of the heights within a square metre, 1 sigma, beside the noise of
+            ranges and beams; nan: too few square metres have enough points.
     """
 
     normal_lidar: Array
@@ -349,25 +350,32 @@ def _judged(
 
 
 def _roughness_m(fit: _Fit, standing: BoolArray, slope: Array, sigma_range_m: float) -> float:
-    """`GroundPlane.roughness_m`: the median over the square metres.
+    """`GroundPlane.roughness_m`, by the scatter within square metres.
 
-    All points near the plane count, not those on it alone: of grass it is the lower part.
+    All points near the plane count, not those on it alone: of grass it is the lower part. Noise of
+    the ranges is most of it near the LiDAR, noise of the beams far away, and the ground is as rough
+    all about: the least of the classes of distance.
     """
     near = fit.usable & ~standing & (np.abs(fit.height) < START_DISTANCE_M)
-    _, cell, number = np.unique(
-        _cells(fit.place[near], CELL_M), return_inverse=True, return_counts=True
-    )
-    enough = number >= CELL_POINTS // 2
-    if np.count_nonzero(enough) < LEAST_CELLS:
+    place = fit.place[near]
+    _, cell, number = np.unique(_cells(place, CELL_M), return_inverse=True, return_counts=True)
+    enough = np.flatnonzero(number >= CELL_POINTS // 2)
+    if len(enough) < CLASSES * LEAST_CELLS:
         return math.nan
-    height, free = fit.height[near], number[enough] - 1.0
-    off = height - (np.bincount(cell, height) / number)[cell]
-    squares = np.bincount(
-        cell, off**2 - (sigma_range_m * slope[near]) ** 2 * (1.0 - 1.0 / number[cell])
-    )
+
+    def mean(of_points: Array) -> Array:
+        return np.asarray(np.bincount(cell, of_points, len(number)) / number)
+
+    height = fit.height[near]
+    scatter = mean((height - mean(height)[cell]) ** 2)[enough]
+    free = number[enough] - 1.0
+    noise = mean((sigma_range_m * slope[near]) ** 2)[enough]
+    variance = scatter * number[enough] / free - noise
     # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
-    variance = squares[enough] / free / (1.0 - 2.0 / (9.0 * free)) ** 3
-    return math.sqrt(max(float(np.median(variance)), 0.0))
+    variance = variance / (1.0 - 2.0 / (9.0 * free)) ** 3
+    order = np.argsort(mean(np.linalg.norm(place, axis=1))[enough], kind="stable")
+    least = min(np.median(variance[part]) for part in np.array_split(order, CLASSES))
+    return math.sqrt(max(float(least), 0.0))
 
 
 def _is_determined(cov: Array) -> bool:

@@ -13,6 +13,7 @@ import pytest
 
 from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.geometry.se3 import tangent_axes
+from caliv_graph.pipeline.preparation import ROUGH_M
 from caliv_graph.products import Array, LidarScan
 from caliv_graph.simulation import load_scenario, simulate_drive
 from caliv_graph.targets.ground.planes import (
@@ -212,17 +213,30 @@ def test_grass_is_not_the_ground() -> None:
     assert abs(np.mean(off, axis=0)[2]) < DISTANCE_FLOOR_M / 2.0
 
 
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_rad"), [(0.03, 0.0), (0.01, 1e-3), (0.02, 7e-4)], ids=str
+)
+def test_a_road_is_smooth_by_a_noisier_lidar_than_is_stated(
+    sigma_m: float, sigma_rad: float
+) -> None:
+    """The range noise of 20 to 30 mm shows near the LiDAR, that of 1 mrad of the beams far away."""
+    scan = scan_of(level, sigma_m=sigma_m, seed=3)
+    aside = np.random.default_rng(4).normal(0.0, sigma_rad, scan.points_lidar.shape)
+    turned = scan.points_lidar + np.cross(aside, scan.points_lidar)
+    assert measured(replace(scan, points_lidar=turned)).roughness_m < 0.9 * ROUGH_M
+
+
 @pytest.mark.parametrize("sigma_m", [0.003, 0.01])
 @pytest.mark.parametrize("mean_m", [0.0, 0.02, 0.035])
 def test_roughness_is_that_of_the_ground_not_of_the_ranges(mean_m: float, sigma_m: float) -> None:
     """Blades of all lengths return flat beams far before the soil; heights scatter by 0.5 to 0.7
-    of the mean, also on a gentle slope and beside things that stand on it."""
+    of the mean, in some part of the ground by 0.4."""
     scan = scan_of(level, wall(10.0, 2.0), sigma_m=sigma_m, seed=3)
     low = scan.points_lidar @ UP_LIDAR < -HEIGHT_M + 0.2
     lift = low * mean_m * np.random.default_rng(3).gamma(2.0, 0.5, len(low))
     points = scan.points_lidar * (1.0 - lift / HEIGHT_M)[:, None]
     plane = measured(replace(scan, points_lidar=points), sigma_m=0.01)
-    assert 0.45 * mean_m - 0.002 < plane.roughness_m < 0.75 * mean_m + 0.002
+    assert 0.4 * mean_m - 0.002 < plane.roughness_m < 0.75 * mean_m + 0.002
 
 
 def test_few_square_metres_do_not_tell_the_roughness() -> None:

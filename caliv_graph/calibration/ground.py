@@ -25,7 +25,7 @@ from caliv_graph.calibration.ground_floors import sharing_places
 from caliv_graph.calibration.problem import Problem
 from caliv_graph.calibration.rates import swept_drives
 from caliv_graph.config.model import GroundConfig
-from caliv_graph.config.range_errors import UNSTATED, RangeErrors
+from caliv_graph.config.range_errors import GROUND_FRAME, UNSTATED, RangeErrors
 from caliv_graph.conventions import (
     key_ground,
     key_ground_bias,
@@ -42,7 +42,7 @@ PLANE_SIGMAS = np.array([1.0, 1.0, 100.0])
 """Prior of a plane: 45 degrees, and 100 m about the drive's poses. It is weak beside the guesses of
 the extrinsics; without it a plane that no LiDAR sees would be singular."""
 
-GROUND_BIASES = 3 + 4
+GROUND_BIASES = 3 + GROUND_FRAME
 """Number of errors that a LiDAR has in common on all the ground it sees: `bias_sigmas`."""
 
 TOGETHER_NS = 5_000_000

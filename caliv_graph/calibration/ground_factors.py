@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
+from caliv_graph.config.range_errors import GROUND_FRAME
 from caliv_graph.geometry.se3 import skew, turned_twist, twist_by_turn
 from caliv_graph.products import Array, GroundObservation
 from caliv_graph.trajectory.rates import by_rates
@@ -215,8 +216,8 @@ def ground_plane_factor(
 
 
 def by_frame(observation: GroundObservation) -> Array:
-    """(3, 4) change of what is predicted of (a, b, distance) if the LiDAR turns, and rises."""
-    out = np.zeros((3, 4))
+    """(3, `GROUND_FRAME`) change of what is predicted if the LiDAR turns, and rises."""
+    out = np.zeros((3, GROUND_FRAME))
     out[:2, :3] = observation.axes_lidar @ skew(observation.normal_lidar)
     out[2, 3] = 1.0
     return out

@@ -64,6 +64,9 @@ CHANNELS_APART_RAD = 0.01
 """Usual angle between two channels: in that distance an error of the beams is another."""
 
 
+GROUND_FRAME = 4
+"""Coordinates of the frame in which a LiDAR sees the ground: three turns and a height."""
+
 LEAST_TILT_RAD, LEAST_HEIGHT_M = 1e-6, 1e-5
 """1 sigma of a tilt and of a height of the ground that are none: far below what any drive tells."""
 
@@ -97,7 +100,7 @@ class RangeErrors:
 
     @property
     def ground_frame(self) -> Array:
-        """(4,) 1 sigma of that frame: three turns, rad, lidar axes; a height, metres."""
+        """(`GROUND_FRAME`,) 1 sigma of that frame: turns in lidar axes, rad; height, metres."""
         tilt_rad = max(self.ground_tilt_rad, LEAST_TILT_RAD)
         return np.array([*[tilt_rad] * 3, max(self.ground_height_m, LEAST_HEIGHT_M)])
 

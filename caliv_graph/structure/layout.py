@@ -8,6 +8,7 @@ from functools import partial
 import gtsam
 import numpy as np
 
+from caliv_graph.config.range_errors import GROUND_FRAME
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import stack, tangent_axes
 from caliv_graph.products import Array, BoolArray, IntArray
@@ -17,9 +18,6 @@ from caliv_graph.trajectory.imu import exp_so3
 
 BIASES = 3
 """Biases of a LiDAR that hold for the whole drive: bias, growth with incidence, on the ground."""
-
-GROUND_FRAME = 4
-"""Coordinates of the frame in which a LiDAR sees the ground (`RangeErrors.ground_frame`)."""
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ import gtsam
 import numpy as np
 import scipy.sparse
 
+from caliv_graph.config.range_errors import GROUND_FRAME
 from caliv_graph.geometry.se3 import skew, stack, tangent_axes, twist_by_turn
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import SeenBeams
 from caliv_graph.structure.bends import BENDS
-from caliv_graph.structure.layout import BIASES, GROUND_FRAME, Layout, State
+from caliv_graph.structure.layout import BIASES, Layout, State
 from caliv_graph.structure.sightings import Sightings
 from caliv_graph.structure.strips import LEVEL
 from caliv_graph.trajectory.imu import exp_so3

@@ -344,12 +344,12 @@ def _judged(
         points=count,
         scatter_m=float(np.sqrt(np.average(height**2, weights=weight))),
         radius_m=radius_m,
-        roughness_m=_roughness_m(fit, standing, beams @ normal, sigma_range_m),
+        roughness_m=_roughness_m(fit, standing),
     )
     return ground, ""
 
 
-def _roughness_m(fit: _Fit, standing: BoolArray, slope: Array, sigma_range_m: float) -> float:
+def _roughness_m(fit: _Fit, standing: BoolArray) -> float:
     """`GroundPlane.roughness_m`, by the scatter within square metres.
 
     All points near the plane count, not those on it alone: of grass it is the lower part. Noise of
@@ -369,7 +369,7 @@ def _roughness_m(fit: _Fit, standing: BoolArray, slope: Array, sigma_range_m: fl
     height = fit.height[near]
     scatter = mean((height - mean(height)[cell]) ** 2)[enough]
     free = number[enough] - 1.0
-    noise = mean((sigma_range_m * slope[near]) ** 2)[enough]
+    noise = mean(fit.sigma_m[near] ** 2)[enough] - UNEVENNESS_M**2
     variance = scatter * number[enough] / free - noise
     # The median of a variance of few degrees of freedom is below its mean (Wilson, Hilferty).
     variance = variance / (1.0 - 2.0 / (9.0 * free)) ** 3

@@ -619,6 +619,20 @@ class Mixture:
 
 
 @dataclass(frozen=True)
+class Surface:
+    """Whether the clouds of a target show a surface.
+
+    Attributes:
+        scatter_m: LiDAR -> scatter of the distances of neighbouring points of a scan from the
+            surfels, along the beams, 1 sigma, metres. Those of a cloud that lies wrong are alike.
+        told_m: LiDAR -> noise of its ranges as it was known before.
+    """
+
+    scatter_m: Mapping[str, float]
+    told_m: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class Registration:
     """Every cloud of a placement registered to the latent target frame.
 
@@ -639,6 +653,7 @@ class Registration:
         converged: whether the last step was below the tolerance.
         last_step: (rotation rad, translation m) of the last iteration: of the median cloud, or of
             the extrinsics where the graph solve took part.
+        surface: whether its clouds show one; None: it was not estimated.
     """
 
     observation: TargetObservation
@@ -651,6 +666,7 @@ class Registration:
     iterations: int
     converged: bool
     last_step: tuple[float, float]
+    surface: Surface | None = None
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError, SolveError, TargetError
 from caliv_graph.pipeline import run as pipeline
 from caliv_graph.pipeline.run import calibrate
+from caliv_graph.products import Surface
 from caliv_graph.uncertainty.consistency import CloudCount
 
 LIDAR = {"topic": "/a", "initial": {"xyz": [0, 0, 1], "rpy_deg": [0, 0, 0]}}
@@ -35,6 +36,7 @@ class Solves:
             "a", 16, 16, (8, 8), (8, 8), (8, 8), (8, 8), np.array([-0.94, 2.38, 0.26])
         )
     )
+    surface: Surface | None = None
     refused: list[TargetError | None] = field(default_factory=list)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -42,9 +44,12 @@ class Solves:
         first = self.refused[-1] is None
         if not first and isinstance(self.second, CalivError):
             raise self.second
+        seen = SimpleNamespace(
+            observation=SimpleNamespace(name="found at (1, 2) m"), surface=self.surface
+        )
         run = SimpleNamespace(
             calibration=SimpleNamespace(status="inconsistent" if first else self.second),
-            solution=SimpleNamespace(structure=self.structure),
+            solution=SimpleNamespace(structure=self.structure, registrations=(seen,)),
             record=SimpleNamespace(trajectories=()),
         )
         return run, self.named
@@ -64,6 +69,13 @@ def test_clouds_on_another_object_are_no_end_of_a_calibration_by_walls() -> None
     assert first is None
     assert "found for a target is none: lidar 'a': 16 of its 16 target clouds" in str(second)
     assert "median offset 2.57 m" in str(second)
+
+
+def test_a_bush_is_no_end_of_a_calibration_by_walls() -> None:
+    bush = Surface({"a": 0.05}, {"a": 0.015})
+    solves = Solves(count=counted(0, 0.0), surface=bush)
+    assert solves.status(config_of()) == "ok"
+    assert "is none: found at (1, 2) m: its clouds show no surface" in str(solves.refused[1])
 
 
 @pytest.mark.parametrize("second", ["inconsistent", SolveError("nothing to solve")])

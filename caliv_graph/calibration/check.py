@@ -25,6 +25,7 @@ from caliv_graph.products import (
     MotionData,
     Recording,
     Solution,
+    Surface,
     Suspect,
 )
 from caliv_graph.readers.pose_frame import poses_source
@@ -86,6 +87,12 @@ def _creeping(solution: Solution) -> Creeping | None:
     return Creeping(len(solution.course), last.turn_rad, last.shift_m, last.sigmas, lidars)
 
 
+def surfaces(solution: Solution) -> dict[str, Surface]:
+    """Placement -> whether the clouds of its target show a surface, where that was estimated."""
+    found = {r.observation.name: r.surface for r in solution.registrations}
+    return {name: of for name, of in found.items() if of is not None}
+
+
 def check(
     calibration: Calibration,
     solution: Solution,
@@ -137,6 +144,7 @@ def check(
             speed_m_s=typical_speed(solution, trajectories),
             strains=strains(solution, drives),
             creeping=_creeping(solution),
+            surfaces=surfaces(solution),
         )
     )
     calibration = replace(calibration, suspects=suspects)
@@ -191,6 +199,8 @@ def _about(found: Contradiction) -> tuple[str, ...]:
             return (found.lidar,)
         case CoarseRegistrations() | Creeping() | RangesDisagree() | GuessesTogether():
             return found.lidars
+        case consistency.NoSurface():
+            return tuple(found.surface.scatter_m)
         case _:
             return ()
 

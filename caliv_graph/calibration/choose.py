@@ -20,14 +20,14 @@ from caliv_graph.config.model import Config
 from caliv_graph.conventions import AXES
 from caliv_graph.errors import RegistrationError, TargetError
 from caliv_graph.geometry.se3 import right_to_vehicle_axes, unstack, vehicle_axes_difference
-from caliv_graph.products import Array, LidarResult, TargetObservation
+from caliv_graph.products import Array, LidarResult, Surface, TargetObservation
 from caliv_graph.readers.pose_frame import poses_source
 from caliv_graph.registration.register import JointRegistration, register_jointly
 from caliv_graph.targets.cloud.choice import Choice, TriedCandidate
 from caliv_graph.targets.cloud.scans import thinned
 from caliv_graph.targets.search.place import WIDE_SIGMAS, Place, Sightings, fit_place
 from caliv_graph.trajectory.select import VehicleTrajectory, are_given, twists_at
-from caliv_graph.uncertainty.consistency import against_guesses, together
+from caliv_graph.uncertainty.consistency import against_guesses, is_scattered, together
 from caliv_graph.uncertainty.observability import UNDETERMINED_RATIO
 from caliv_graph.wording.contradictions import PosesGiven, contradiction_sentence
 
@@ -77,17 +77,24 @@ class Agreement:
         scatter_m: of its centre in the map; infinite where there is nothing to compare.
         place: where it stands.
         sightings: the centres.
+        surface: whether its clouds show one.
     """
 
     scatter_m: float
     place: Place | None = None
     sightings: Sightings | None = None
+    surface: Surface | None = None
+
+    @property
+    def foliage(self) -> bool:
+        """Whether its clouds show no surface."""
+        return self.surface is not None and is_scattered(self.surface)
 
 
 def choose_static(
     candidates: Sequence[TriedCandidate], trajectory: VehicleTrajectory, config: Config
 ) -> Choice:
-    """The candidate that is static and that most LiDARs see best; with reasons.
+    """The candidate that is static, shows a surface, and that most LiDARs see best; with reasons.
 
     One candidate without a doubt is not tried: there is nothing to choose.
 
@@ -100,16 +107,18 @@ def choose_static(
     scatter = [each.scatter_m for each in found]
     limit = max(AGREE_M, AGREE_RATIO * min(scatter))
 
-    def rank(i: int) -> tuple[bool, int, bool, float]:
+    def rank(i: int) -> tuple[bool, bool, int, bool, float]:
         of = candidates[i].found
         static = scatter[i] <= limit and math.isfinite(scatter[i])
-        return static, len(candidates[i].lidars), not of.doubtful, of.score
+        solid = not found[i].foliage
+        return static, solid, len(candidates[i].lidars), not of.doubtful, of.score
 
     apart = _different(candidates, found)
     best = max(apart, key=rank)
     others = [i for i in apart if i != best]
-    same = [i for i in others if rank(i)[0]]
-    worse = [i for i in others if math.isfinite(scatter[i]) and i not in same]
+    same = [i for i in others if rank(i)[:2] == (True, True)]
+    leaves = [i for i in others if found[i].foliage and not found[best].foliage]
+    worse = [i for i in others if math.isfinite(scatter[i]) and i not in [*same, *leaves]]
     of = candidates[best].found
     if of.doubtful and scatter[best] > MOVES_M and cause_of(found[best], config) is None:
         raise TargetError(*_why_none_stands(candidates, scatter))
@@ -127,6 +136,9 @@ def choose_static(
             f"chosen because its clouds agree on one place of the map to {scatter[best]:.2f} m; "
             f"those of other objects agree less: {listed}"
         )
+    if leaves:
+        listed = ", ".join(str(candidates[i].found) for i in leaves)
+        reasons.append(f"chosen because others show no surface, as bushes do: {listed}")
     return Choice(best, tuple(reasons))
 
 
@@ -326,17 +338,21 @@ def _agreement(
     ]
     if len(clouds) < 2:
         return Agreement(math.inf)
-    sightings = _sightings(replace(observation, clouds=tuple(clouds)), trajectory, config)
-    if sightings is None:
+    found = _sightings(replace(observation, clouds=tuple(clouds)), trajectory, config)
+    if found is None:
         return Agreement(math.inf)
+    sightings, surface = found
     place = fit_place(sightings, _guesses(config))
-    return Agreement(place.scatter_m, place, sightings)
+    return Agreement(place.scatter_m, place, sightings, surface)
 
 
 def _sightings(
     observation: TargetObservation, trajectory: VehicleTrajectory, config: Config
-) -> Sightings | None:
-    """The object's centre in each cloud, by a small free registration; None if it failed."""
+) -> tuple[Sightings, Surface | None] | None:
+    """The object's centre in each cloud, and its surface, by a small free registration.
+
+    None if that failed.
+    """
     stamps = [cloud.stamp_ns for cloud in observation.clouds]
     R, t = trajectory.poses_at(stamps)
     poses = [
@@ -355,7 +371,7 @@ def _sightings(
     except RegistrationError:
         return None
     centres: Array = np.array([T.inverse().translation() for T in registered.T_target_lidar])
-    return Sightings(
+    sightings = Sightings(
         lidars=tuple(cloud.lidar for cloud in observation.clouds),
         centres_lidar=centres,
         R_map_vehicle=R,
@@ -363,3 +379,4 @@ def _sightings(
         twists=twists_at(trajectory, stamps),
         times_s=1e-9 * (np.array(stamps) - stamps[0]),
     )
+    return sightings, registered.surface

@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from caliv_graph.calibration.assemble import assemble
-from caliv_graph.calibration.check import check, cloud_counts
+from caliv_graph.calibration.check import check, cloud_counts, surfaces
 from caliv_graph.calibration.choose import SAME_OBJECT_M
 from caliv_graph.calibration.estimate import estimate_with_noise
 from caliv_graph.calibration.requirements import unmet_requirements
@@ -47,8 +47,12 @@ from caliv_graph.readers.sampled import SampledRecording
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
-from caliv_graph.uncertainty.consistency import CONTRADICTION_SIGMAS, too_many_outliers
-from caliv_graph.wording.contradictions import outliers_text
+from caliv_graph.uncertainty.consistency import (
+    CONTRADICTION_SIGMAS,
+    too_many_outliers,
+    without_surface,
+)
+from caliv_graph.wording.contradictions import no_surface_text, outliers_text
 from caliv_graph.wording.mounting import mistake_sentence
 from caliv_graph.wording.structure import (
     nothing_sentence,
@@ -106,12 +110,16 @@ def _calibrate(
 def no_target_of(run: CalibrationRun, config: Config) -> TargetError | None:
     """Why the object that the search found is no target; None: nothing speaks against it.
 
-    Most clouds of a LiDAR lie elsewhere than the others: on the next object, or along a hedge.
+    Most clouds of a LiDAR lie elsewhere than the others: on the next object, or along a hedge. Or
+    they show no surface, as those of foliage.
     """
     if run.calibration.status != "inconsistent" or config.target is not None:
         return None
     if not run.solution.structure or run.record is None:
         return None
+    scattered = without_surface(surfaces(run.solution))
+    if scattered:
+        return TargetError(wrong_target_sentence(no_surface_text(scattered[0])))
     for count in cloud_counts(run.solution, run.record.trajectories):
         off = count.offset_vehicle
         if (

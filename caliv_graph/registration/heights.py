@@ -9,12 +9,15 @@ a beam averages, is across the surface: the roughness. Variances of a LiDAR's he
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from caliv_graph.products import Array, IntArray
+from caliv_graph.registration.clouds import CloudStack
 
 LEAST_SIGMA_M = 1e-3
 """Smallest roughness and noise of the range, metres: below what ranges are quantised to."""
@@ -26,6 +29,21 @@ repeated scans of two OS1-128: 3 to 4.5 mm."""
 
 PRIOR_POINTS = 50.0
 """Points that the noise of the range as it is known before counts as when it is estimated."""
+
+
+FAR_NEIGHBOURS, FAR_SIGMAS = 0.9, 1.6449
+"""Part of the pairs of neighbours that are nearer to each other than this quantile, and its size in
+standard deviations. Leaves are larger than what is between two beams: most neighbours lie on one.
+Of the pairs of a chair, less than a tenth have an edge between them."""
+
+FEWEST_NEIGHBOURS = 50
+"""Pairs of neighbours that tell the scatter of a LiDAR's points."""
+
+ON_TARGET = 0.5
+"""Probability from which on a point is taken for one of the target."""
+
+OTHER_CLOUD = 10.0
+"""What keeps the beams of two clouds apart, in units of their directions."""
 
 
 @dataclass(frozen=True)
@@ -172,3 +190,31 @@ class HeightSums:
     def mean_cosine2(self) -> Array:
         """(L,) mean squared cosine of incidence."""
         return np.asarray(self.cosine2 / np.maximum(self.points, 1e-12))
+
+
+def scatter_of_neighbours(stack: CloudStack, slides_m: Array, explained: Array) -> Array:
+    """(L,) scatter of the points of each LiDAR about the surface, within scans, 1 sigma, metres.
+
+    From differences between each point of the target and the nearest one of its cloud by direction:
+    a cloud that lies wrong has them alike, and foliage has none. NaN: a LiDAR has too few.
+
+    Args:
+        stack: the clouds.
+        slides_m: (N,) distance of each point from the surface, along its beam.
+        explained: (N,) probability that it is of the target.
+    """
+    own = np.flatnonzero(explained > ON_TARGET)
+    out = np.full(stack.lidars, math.nan)
+    if len(own) < FEWEST_NEIGHBOURS:
+        return out
+    apart = np.column_stack([stack.beams[own], OTHER_CLOUD * stack.cloud[own]])
+    nearest = own[np.asarray(cKDTree(apart).query(apart, 2)[1])[:, 1]]
+    together = stack.cloud[own] == stack.cloud[nearest]
+    own, nearest = own[together], nearest[together]
+    apart_m = np.abs(slides_m[own] - slides_m[nearest])
+    lidar = stack.lidar[stack.cloud[own]]
+    for a in range(stack.lidars):
+        of = apart_m[lidar == a]
+        if len(of) >= FEWEST_NEIGHBOURS:
+            out[a] = float(np.quantile(of, FAR_NEIGHBOURS)) / (FAR_SIGMAS * math.sqrt(2.0))
+    return out

@@ -21,10 +21,17 @@ from caliv_graph.config.guesses import DEFAULT_GUESS_SIGMAS, stated_sigmas
 from caliv_graph.config.model import Config
 from caliv_graph.errors import RegistrationError
 from caliv_graph.geometry.se3 import stack, unstack
-from caliv_graph.products import Array, IntArray, Mixture, Registration, TargetObservation
+from caliv_graph.products import (
+    Array,
+    IntArray,
+    Mixture,
+    Registration,
+    Surface,
+    TargetObservation,
+)
 from caliv_graph.registration.centring import depth_of, middles_of
 from caliv_graph.registration.clouds import CloudStack, merged_normals, stack_clouds
-from caliv_graph.registration.heights import HeightNoise
+from caliv_graph.registration.heights import HeightNoise, scatter_of_neighbours
 from caliv_graph.registration.mixture import expect, maximise_shape, seed_mixture
 from caliv_graph.registration.moments import Responsibilities, cell_moments
 from caliv_graph.registration.placing import placed_by_motion
@@ -165,6 +172,7 @@ class JointRegistration:
         self._near: IntArray | None = None
         self._near_held = 0
         self.inlier_ratio: Array = np.ones(self.clouds.count)
+        self._slides: tuple[Array, Array] | None = None
         self._views = np.ones(self.clouds.count) if views is None else views
         self.noise = self._configured = HeightNoise.configured(
             self.clouds.lidars, sigmas_m, self._floor
@@ -268,6 +276,7 @@ class JointRegistration:
         """The quadratic on the poses that follows from an E-step at `T_target_lidar` (R, t)."""
         self.inlier_ratio = who.inlier_ratio
         cells = cell_moments(self.clouds, who, len(self.mixture.weights))
+        self._slides = who.slides_m, who.explained
         quadratic = shape_quadratic(self.clouds, R, t, self.mixture, cells, who)
         if self.finest and not self.settled:
             taken_up = quadratic.shape_parameters()
@@ -281,6 +290,19 @@ class JointRegistration:
     def settled(self) -> bool:
         """Whether tiles and noise are what they are (`TILES_SETTLE`)."""
         return self._by_beams_for >= TILES_SETTLE
+
+    def surface(self) -> Surface | None:
+        """Whether the clouds show a surface; None before annealing has reached the noise."""
+        if not self.finest or self._slides is None:
+            return None
+        scatter_m = scatter_of_neighbours(self.clouds, *self._slides)
+        told_m = np.sqrt(self._configured.range_m2)
+        known = np.isfinite(scatter_m)
+        names = [name for name, has in zip(self._names, known, strict=True) if has]
+        return Surface(
+            dict(zip(names, scatter_m[known].tolist(), strict=True)),
+            dict(zip(names, told_m[known].tolist(), strict=True)),
+        )
 
     def _noise_now(self) -> HeightNoise:
         """The noise of the heights, annealed."""
@@ -327,6 +349,7 @@ class JointRegistration:
             iterations=iterations,
             converged=converged,
             last_step=last_step,
+            surface=self.surface(),
         )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import gtsam
@@ -22,7 +22,7 @@ from caliv_graph.geometry.se3 import (
     vehicle_axes_difference,
 )
 from caliv_graph.mounting.mirror import are_mirror_images
-from caliv_graph.products import Array, Guess, LidarResult
+from caliv_graph.products import Array, Guess, LidarResult, Surface
 from caliv_graph.trajectory.heading import HeadingSource
 from caliv_graph.uncertainty.observability import UNIT, scaling
 
@@ -78,6 +78,10 @@ SCALE_LIMIT = 5.0
 """Sigmas of registrations over what independent point errors give. Points of one channel share that
 channel's calibration error: with about 25 points of a channel on a chair 8 m away, sigmas are
 sqrt(25) times as large. No known LiDAR effect exceeds this."""
+
+FOLIAGE_NOISE, FOLIAGE_M = 3.0, 0.03
+"""Where neighbouring points of each LiDAR scatter along the beams by so many times the noise of its
+ranges, and by so much, 1 sigma, there is no surface. Ranges may be noisier than they are told."""
 
 RANGE_BIAS_LIMIT_M = 0.01
 """1 sigma of the biases of ranges that a calibration may have: data sheets of LiDARs state an
@@ -242,6 +246,7 @@ class CheckInputs:
         speed_m_s: median over the clouds.
         strains: of the drives with a smoothed trajectory.
         creeping: the joint loop, if it ended far from where it leads.
+        surfaces: placement -> whether the clouds of its target show one.
     """
 
     lidars: Mapping[str, LidarResult]
@@ -255,6 +260,7 @@ class CheckInputs:
     speed_m_s: float = 0.0
     strains: Sequence[Strain] = ()
     creeping: Creeping | None = None
+    surfaces: Mapping[str, Surface] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -354,6 +360,19 @@ class Creeping:
 
 
 @dataclass(frozen=True)
+class NoSurface:
+    """Clouds of a target that show no surface, as those of a bush.
+
+    Attributes:
+        target: name of the placement.
+        surface: what shows it.
+    """
+
+    target: str
+    surface: Surface
+
+
+@dataclass(frozen=True)
 class RangesDisagree:
     """Ranges of LiDARs on several targets that no mounting brings together.
 
@@ -372,6 +391,7 @@ Contradiction = (
     | CloudCount
     | CoarseRegistrations
     | Creeping
+    | NoSurface
     | RangesDisagree
     | ScoreTest
     | Assumed
@@ -392,6 +412,7 @@ def contradictions(inputs: CheckInputs) -> tuple[Contradiction, ...]:
         *(count for count in inputs.counts if too_many_outliers(count)),
         *coarse_registrations(inputs),
         *([] if inputs.creeping is None else [inputs.creeping]),
+        *without_surface(inputs.surfaces),
         *disagreeing_ranges(inputs),
         *(test for test in inputs.score_tests if p_value(test) < CONTRADICTION_P),
         *(each for each in inputs.assumed if assumption_contradicted(each)),
@@ -625,6 +646,19 @@ def coarse_registrations(inputs: CheckInputs) -> tuple[CoarseRegistrations, ...]
             tuple(count.lidar for count in inputs.counts),
             likely,
         ),
+    )
+
+
+def without_surface(surfaces: Mapping[str, Surface]) -> tuple[NoSurface, ...]:
+    """The targets whose clouds show no surface."""
+    return tuple(NoSurface(name, of) for name, of in surfaces.items() if is_scattered(of))
+
+
+def is_scattered(surface: Surface) -> bool:
+    """Whether the points of all LiDARs scatter far beyond the noise of their ranges."""
+    return bool(surface.scatter_m) and all(
+        scatter_m >= max(FOLIAGE_NOISE * surface.told_m[name], FOLIAGE_M)
+        for name, scatter_m in surface.scatter_m.items()
     )
 
 

@@ -26,6 +26,7 @@ from caliv_graph.uncertainty.consistency import (
     GuessContradiction,
     GuessesTogether,
     Heading,
+    NoSurface,
     RangesDisagree,
     ScoreTest,
     Strain,
@@ -75,6 +76,8 @@ def contradiction_sentence(
             return _coarse(found, led)
         case Creeping():
             return _creeping(found, led)
+        case NoSurface():
+            return f"{no_surface_text(found)}{'' if led else _NO_SURFACE_REMEDY}"
         case RangesDisagree():
             return _ranges(found, led)
         case ScoreTest():
@@ -98,6 +101,25 @@ def _creeping(found: Creeping, led: bool) -> str:
         f"{1e3 * found.shift_m:.1f} mm ({found.sigmas:.1f} sigma) in one; they may be off by many "
         f"of their sigmas{'' if led else advice}"
     )
+
+
+def no_surface_text(found: NoSurface) -> str:
+    """What the clouds of a target without a surface show."""
+    told_m = found.surface.told_m
+    scatter = ", ".join(
+        f"'{name}' by {1e3 * scatter_m:.0f} mm for {1e3 * told_m[name]:.0f}"
+        for name, scatter_m in found.surface.scatter_m.items()
+    )
+    return (
+        f"{found.target}: its clouds show no surface, as those of a bush: neighbouring points "
+        f"scatter along the beams by far more than the noise of the ranges ({scatter})"
+    )
+
+
+_NO_SURFACE_REMEDY = (
+    ". Use a target with solid faces (a chair, a box) or none (target: false), or state the noise "
+    "of the LiDAR (noise.lidar_range_m) if it is that large"
+)
 
 
 def _strain(found: Strain, led: bool) -> str:

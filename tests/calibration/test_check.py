@@ -22,6 +22,7 @@ from caliv_graph.products import (
     Iteration,
     LidarResult,
     Solution,
+    Surface,
     Suspect,
     VehicleParameter,
 )
@@ -181,6 +182,32 @@ def test_a_loop_that_ended_on_its_way_is_a_contradiction_of_the_lidars_that_see_
     assert said == (() if found is None else (found,))
 
 
+@pytest.mark.parametrize(
+    ("scatter_m", "scattered"),
+    [
+        ({"left": 0.031, "right": 0.05}, True),
+        ({"left": 0.031, "right": 0.044}, False),
+        ({"left": 0.029, "right": 0.05}, False),
+        ({}, False),
+    ],
+    ids=["a bush", "one LiDAR sees a surface", "noisier than told", "too few points"],
+)
+def test_clouds_that_show_no_surface_are_a_contradiction(
+    scatter_m: dict[str, float], scattered: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface = Surface(scatter_m, {"left": 0.008, "right": 0.015})
+    seen = SimpleNamespace(observation=SimpleNamespace(name="bush"), surface=surface)
+    unknown = SimpleNamespace(observation=SimpleNamespace(name="other"), surface=None)
+    lidars = {"left": unseen(), "right": unseen(), "roof": unseen()}
+    calibration = replace(nothing_calibrated(), lidars=lidars)
+    result, _, concerned = checked(calibration, monkeypatch, registrations=(unknown, seen))
+    assert concerned == (("left", "right") if scattered else ())
+    assert result.status == ("inconsistent" if scattered else "ok")
+    said = " ".join(result.contradictions)
+    assert ("bush: its clouds show no surface" in said) == scattered
+    assert ("'left' by 31 mm for 8" in said) == scattered
+
+
 def nothing_calibrated() -> Calibration:
     nothing = np.zeros((0, 0))
     return Calibration("ok", "", {}, nothing, nothing, (), (), (), {})
@@ -191,7 +218,10 @@ def unseen() -> LidarResult:
 
 
 def checked(
-    calibration: Calibration, monkeypatch: pytest.MonkeyPatch, **of: object
+    calibration: Calibration,
+    monkeypatch: pytest.MonkeyPatch,
+    registrations: object = (),
+    **of: object,
 ) -> tuple[Calibration, tuple[str, ...], tuple[str, ...]]:
     """A calibration that is checked; `of` is what the parts of the check find."""
     found = {
@@ -206,7 +236,10 @@ def checked(
     for name, value in (found | of).items():
         monkeypatch.setattr(checks, name, lambda *_, value=value: value)
     solution = cast(
-        "Solution", SimpleNamespace(registration_scale=1.0, range_bias_m=0.0, creeps=False)
+        "Solution",
+        SimpleNamespace(
+            registration_scale=1.0, range_bias_m=0.0, creeps=False, registrations=registrations
+        ),
     )
     config = cast("Config", None)  # of the suspects
     return checks.check(calibration, solution, [], [], {}, config)

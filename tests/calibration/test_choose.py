@@ -56,8 +56,16 @@ def shape() -> Array:
     )
 
 
+def leaves(rng: np.random.Generator) -> Array:
+    """(n, 3) points of a bush of that size: others in each scan."""
+    return rng.uniform([-0.7, -0.7, 0.1], [0.7, 0.7, 1.5], (150, 3))
+
+
 def observation(
-    at: Array, velocity: Sequence[float] = (0.0, 0.0, 0.0), late_s: float = 0.0
+    at: Array,
+    velocity: Sequence[float] = (0.0, 0.0, 0.0),
+    late_s: float = 0.0,
+    bush: bool = False,
 ) -> TargetObservation:
     """Clouds of an object that all LiDARs see all round, in both circles."""
     rng = np.random.default_rng(1)
@@ -67,7 +75,8 @@ def observation(
         for time_s in np.linspace(3.0, last_s - 3.0, 16).tolist():
             (T,) = DRIVE.poses(np.array([round((time_s - late_s) * 1e9)]))
             where = at + np.array(velocity) * (time_s - 0.5 * last_s)
-            points = T.compose(mount.pose()).transformTo((shape() + where).T).T
+            seen = leaves(rng) if bush else shape()
+            points = T.compose(mount.pose()).transformTo((seen + where).T).T
             points = points + rng.normal(0.0, 0.01, points.shape)
             clouds.append(TargetCloud(name, 0, round(time_s * 1e9), points, f"{time_s}"))
     return TargetObservation(0, "target", at + MIDDLE, tuple(clouds))
@@ -109,6 +118,15 @@ def test_of_two_static_ones_the_better_seen_wins_and_the_other_is_named() -> Non
     assert choice.index == 1
     (reason,) = choice.reasons
     assert "Other static objects fit too: (10.5, -2.0) 0.5 m wide 1.0 m high" in reason
+
+
+def test_a_bush_loses_however_well_it_is_seen() -> None:
+    bush = candidate(observation(WALKER, bush=True), WALKER, score=90.0)
+    chair = candidate(observation(CHAIR), CHAIR, score=20.0)
+    choice = choose_static([bush, chair], trajectory(), CONFIG)
+    assert choice.index == 1
+    (reason,) = choice.reasons
+    assert reason.startswith("chosen because others show no surface, as bushes do: (10.5, -2.0)")
 
 
 def test_two_proposals_of_one_object_are_one() -> None:

@@ -33,6 +33,7 @@ from caliv_graph.registration.register import (
     register_jointly,
 )
 from caliv_graph.registration.surfels import Surfels
+from caliv_graph.uncertainty.consistency import is_scattered
 from tests.registration.scenes import (
     Scene,
     centre_clouds,
@@ -45,6 +46,7 @@ from tests.registration.scenes import (
     observe,
     plates,
     rms,
+    seen_from,
 )
 
 
@@ -122,6 +124,19 @@ def test_frame_stays_where_the_guesses_put_it() -> None:
     low, high = np.percentile(registration.mixture.means_target, [1, 99], axis=0)
     assert np.abs(0.5 * (low + high)).max() < 0.1
     assert high - low == pytest.approx([0.75, 0.7, 1.2], abs=0.12)
+
+
+def test_a_bush_shows_no_surface_and_a_chair_does() -> None:
+    rng = np.random.default_rng(4)
+    poses = chair().T_target_lidar
+    leaves = [seen_from(T, rng.uniform(-0.7, 0.7, (70, 3)), SIGMA_M, rng) for T in poses]
+    of_bush, of_chair = registered(leaves, poses).surface, chair_registration().surface
+    assert of_bush is not None
+    assert of_chair is not None
+    assert is_scattered(of_bush)
+    assert not is_scattered(of_chair)
+    assert of_chair.scatter_m["front"] == pytest.approx(SIGMA_M, rel=0.3)
+    assert of_chair.told_m == {"front": SIGMA_M}
 
 
 def test_another_guess_finds_the_same() -> None:

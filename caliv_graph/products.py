@@ -679,6 +679,8 @@ class Iteration:
         sigmas: the step in joint standard deviations of the extrinsics.
         weight_change: largest change of a cloud's robust weight.
         undetermined: number of undetermined directions; None: mode `joint`.
+        way_sigmas: how far the extrinsics have come in the last iterations (`refine.WAY`), in joint
+            standard deviations; 0: there were fewer.
     """
 
     turn_rad: float
@@ -686,6 +688,7 @@ class Iteration:
     sigmas: float
     weight_change: float
     undetermined: int | None = None
+    way_sigmas: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,10 @@ from caliv_graph.products import Array
 FREEDOM = 4.0
 """Degrees of freedom of the distribution of errors of strips: heavy tails."""
 
+LEAST_TOLD = 0.02
+"""What counts beside the errors that tell a size: where none does, sigmas are ten times the usual
+ones. The side of a car, in other patches of each of two LiDARs, had one tilted by 12 mrad."""
+
 
 def heavy_tailed(
     known: Array, square: Array, before: Array, usual: float, limits: tuple[float, float]
@@ -27,5 +31,14 @@ def heavy_tailed(
     own_weight = (FREEDOM + known) / (FREEDOM + square / middle**2)
     common = (usual**2 + float(own_weight @ square)) / (1.0 + float(known.sum()))
     common = float(np.clip(common, least, most))
+    common *= told_by_few(float(known.sum()))
     out = (FREEDOM * common + square) / (FREEDOM + known)
     return np.asarray(np.sqrt(np.clip(out, least, most)))
+
+
+def told_by_few(number: float) -> float:
+    """By how much a variance grows that so many errors tell: that of a t distribution.
+
+    It has as many degrees of freedom, and two.
+    """
+    return 1.0 + 2.0 / (LEAST_TOLD + number)

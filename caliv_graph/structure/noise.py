@@ -15,7 +15,7 @@ from caliv_graph.config.range_errors import RangeErrors, SizePrior, size_weights
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import BeamErrors, mean_rows, parts_of
 from caliv_graph.structure.bends import BENDS, USUAL_PER_M
-from caliv_graph.structure.heavy_tails import FREEDOM, heavy_tailed
+from caliv_graph.structure.heavy_tails import FREEDOM, heavy_tailed, told_by_few
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
@@ -26,6 +26,9 @@ from caliv_graph.structure.views import Views
 FIRST_SIGHTING_M = 0.01
 """1 sigma of the offset of a strip from scan to scan before it is estimated: on the safe side, as
 rough extrinsics are still in it."""
+
+SIGHTING_USUAL_M = 0.002
+"""1 sigma of that offset where nothing tells, which counts as one sighting."""
 
 LEAST_M = 2e-4
 """Smallest sigma of an offset: what no LiDAR resolves."""
@@ -195,7 +198,10 @@ def fitted_noise(
     of_points = 1.0 / sightings.moments[:, 3, 3]
     of_lidar = nuisances.of_lidar(sightings.strip, lidar, level) ** 2
     point = of_points + of_lidar
-    total_sigma = common_sigma(offsets, point, free)
+    told = free * float(weights.sum())
+    variance = common_sigma(offsets, point, free) ** 2
+    variance = (SIGHTING_USUAL_M**2 + told * variance) / (1.0 + told) * told_by_few(told)
+    total_sigma = math.sqrt(variance)
     limit = 3.0 * np.sqrt(point + total_sigma**2)
     shared = _shared_variance(np.clip(offsets, -limit, limit), group) / free
     shared = float(np.clip(shared, LEAST_M**2, 0.9 * total_sigma**2 + LEAST_M**2))
@@ -203,8 +209,10 @@ def fitted_noise(
     square = np.clip(offsets, -limit, limit) ** 2 / free - point - shared
     total = np.bincount(sightings.strip, square, layout.strips)
     count = np.bincount(sightings.strip, minlength=layout.strips)
-    own = (OWN_STRIP * common**2 + total) / (OWN_STRIP + count)
     one = len(np.unique(views.of_scan)) <= layout.lidars
+    # The estimate takes up the rest of the offsets, which then seem small.
+    left = 1.0 if one else free
+    own = (OWN_STRIP * common**2 + left * total) / (OWN_STRIP + left * count)
     view = views.of_scan[sightings.scan] * layout.strips + sightings.strip
     again = _shared_variance(np.clip(offsets, -limit, limit), view) / free
     sighting = np.sqrt(np.maximum(own, (ONE_VIEW_M if one else LEAST_M) ** 2))

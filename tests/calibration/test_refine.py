@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import cast
 
 import gtsam
@@ -12,6 +13,7 @@ import pytest
 
 from caliv_graph.calibration.refine import (
     MOST_ROUNDS,
+    WAY,
     _in_rounds,
     _Loop,
     creeps,
@@ -96,6 +98,19 @@ class Rounds:
         return last.sigmas <= 0.05
 
 
+@dataclass
+class Moving:
+    """A loop whose LiDAR moves along x."""
+
+    step_m: float = 0.001
+    x_m: float = 0.0
+    ends: list[list[gtsam.Pose3]] = field(default_factory=list)
+
+    def extrinsics(self) -> list[gtsam.Pose3]:
+        self.x_m += self.step_m
+        return [gtsam.Pose3(gtsam.Rot3(), np.array([self.x_m, 0.0, 0.0]))]
+
+
 @pytest.mark.parametrize(
     ("sigmas", "rounds", "iterations", "converged"),
     [
@@ -136,3 +151,21 @@ def test_what_does_not_move_does_not_creep() -> None:
     assert not creeps([])
     assert not creeps([Iteration(1e-5, 1e-4, 1.0, 0.5)] * 30)
     assert creeps([Iteration(1e-5, 1e-3, 1.0, 0.5)] * 30)
+
+
+@pytest.mark.parametrize(("way_sigmas", "on_its_way"), [(2.4, False), (4.5, True)])
+def test_small_steps_that_lead_far_creep(way_sigmas: float, on_its_way: bool) -> None:
+    steps = [Iteration(3e-4, 2e-3, 0.45, 0.1, way_sigmas=way_sigmas)] * 30
+    assert creeps(steps) == on_its_way
+    assert not creeps([replace(step, turn_rad=1e-5, shift_m=1e-4) for step in steps])
+
+
+def test_the_way_of_a_loop_is_that_of_its_last_iterations() -> None:
+    """x goes by 1 mm in each, with a sigma of 2 mm: 5 sigmas in ten; to and fro it is none."""
+    loop = Moving()
+    way = partial(_Loop._way_sigmas, cast("_Loop", loop), np.eye(6) / 0.002**2)
+    ways = [way() for _ in range(WAY + 4)]
+    assert ways[:WAY] == [0.0] * WAY
+    assert ways[WAY:] == pytest.approx([5.0] * 4)
+    loop.step_m = -0.001
+    assert [way() for _ in range(5)] == pytest.approx([4.0, 3.0, 2.0, 1.0, 0.0])

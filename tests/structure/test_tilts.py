@@ -1,11 +1,13 @@
 """Tilts of sightings: their noise, and what LiDARs repeat of it, against known sizes."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.heavy_tails import heavy_tailed, told_by_few
 from caliv_graph.structure.layout import Nuisances
 from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings
@@ -122,7 +124,7 @@ def test_turns_of_whole_scans_are_no_tilts_of_walls() -> None:
 def test_one_lidar_alone_does_not_tell_what_it_repeats() -> None:
     own, repeated, _ = fitted(1)
     assert own == pytest.approx(OWN_RAD, rel=0.05)
-    assert repeated == pytest.approx(USUAL_RAD)
+    assert repeated == pytest.approx(USUAL_RAD * math.sqrt(told_by_few(0.0)))
 
 
 def test_robust_weights_count() -> None:
@@ -151,3 +153,22 @@ def test_scans_of_few_strips_say_less_of_what_is_repeated() -> None:
     few = replace(sightings, scan=sightings.scan + 1000 * (sightings.strip // FEW))
     _, repeated, _ = sizes_of(few, geometry, lidar, np.ones(sightings.count))
     assert np.sqrt(np.mean(repeated**2)) == pytest.approx(REPEATED_RAD, rel=0.2)
+
+
+def test_sizes_that_few_strips_tell_are_larger() -> None:
+    """The variance of a t distribution: of `n + 2` degrees of freedom, `1 + 2 / n` times."""
+    assert told_by_few(1.0) == pytest.approx(3.0, rel=0.02)
+    assert told_by_few(200.0) == pytest.approx(1.01, rel=1e-4)
+
+    def common(strips: int, told: float) -> float:
+        """The sigma of strips whose errors are 2 mm, of which the data tell a part."""
+        known = np.full(strips, told)
+        sigma = np.full(strips, 0.003)
+        for _ in range(50):
+            sigma = heavy_tailed(known, known * 0.002**2, sigma, 0.003, (2e-4, 0.05))
+        return float(sigma[0])
+
+    assert common(1, 0.0) == pytest.approx(0.003 * math.sqrt(101.0))
+    assert common(1, 0.5) > 0.004
+    assert 0.002 < common(10, 0.5) < 0.0035
+    assert common(400, 1.0) == pytest.approx(0.002, rel=0.02)

@@ -25,6 +25,7 @@ from caliv_graph.config.noise import NoiseConfig
 from caliv_graph.products import Array
 from caliv_graph.trajectory.correlated import GROUPS, MOVES, CorrelatedError
 from caliv_graph.trajectory.effects import ErrorEffects, smoothed_in_time
+from caliv_graph.trajectory.error_likelihood import ErrorLikelihood
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.test_variances import base, recorded, shifted, smoothed
 
@@ -126,6 +127,23 @@ def test_an_error_of_the_fixes_that_is_correlated_over_time_is_found() -> None:
     assert found.heave_m == pytest.approx(5e-3, rel=0.35)
     names = {level.name: level for level in found.levels}
     assert names["gnss_correlated_horizontal"].time_s == error.time_s
+
+
+def test_an_error_that_the_motion_data_rule_out_is_none_of_the_fixes() -> None:
+    """What the LiDARs have wrong looks like 30 mm of them; an IMU knows them to 2 mm."""
+    made = evidence(2, 5e-3, CorrelatedError("gnss", (0.03, 0.03, 0.0075), 4.0))
+    (alone,) = estimated(made, NoiseConfig()).correlated
+    assert alone.sigmas[0] > 0.02
+    size = 3 * STEPS
+    known = np.diag(np.full(size, 0.002**-2.0))
+    small = 0.002 * np.random.default_rng(1).standard_normal(size)
+    motion = ErrorLikelihood(("gnss",), STAMPS, known, known @ small)
+    within = replace(made, motion=[motion], sensor_sigmas={"gnss": np.full(3, 0.01)})
+    found = estimated(within, NoiseConfig())
+    assert all(error.sigmas[0] < 0.005 for error in found.correlated)
+    silent = replace(motion, information=np.zeros((size, size)), gradient=np.zeros(size))
+    (as_before,) = estimated(replace(made, motion=[silent]), NoiseConfig()).correlated
+    assert as_before.sigmas == pytest.approx(alone.sigmas, rel=0.05)
 
 
 def test_an_error_of_the_heading_is_none_of_roll_and_pitch() -> None:

@@ -679,8 +679,8 @@ class Iteration:
         sigmas: the step in joint standard deviations of the extrinsics.
         weight_change: largest change of a cloud's robust weight.
         undetermined: number of undetermined directions; None: mode `joint`.
-        way_sigmas: how far the extrinsics have come in the last iterations (`refine.WAY`), in joint
-            standard deviations; 0: there were fewer.
+        way_sigmas: how far the extrinsics have come in the last ten iterations (`refine.WAY`), in
+            joint standard deviations; 0: there were fewer since the shapes began.
     """
 
     turn_rad: float

@@ -84,7 +84,8 @@ def _creeping(solution: Solution) -> Creeping | None:
     last = max(solution.course[-LAST_STEPS:], key=lambda step: step.sigmas)
     seeing = {c.lidar for r in solution.registrations for c in r.observation.clouds}
     lidars = tuple(name for name in solution.lidars if name in seeing)
-    return Creeping(len(solution.course), last.turn_rad, last.shift_m, last.sigmas, lidars)
+    step = last.turn_rad, last.shift_m, last.sigmas
+    return Creeping(len(solution.course), *step, lidars, solution.course[-1].way_sigmas)
 
 
 def surfaces(solution: Solution) -> dict[str, Surface]:
@@ -191,7 +192,7 @@ def _given(motions: Mapping[int, MotionData], config: Config) -> PosesGiven | No
 
 
 def _about(found: Contradiction) -> tuple[str, ...]:
-    """LiDARs that a finding is about; none if it is about the motion or the ground."""
+    """LiDARs that a finding is about; none if it is about motion, ground or the target itself."""
     match found:
         case GuessContradiction(swapped_with=str() as other):
             return (found.lidar, other)
@@ -199,8 +200,6 @@ def _about(found: Contradiction) -> tuple[str, ...]:
             return (found.lidar,)
         case CoarseRegistrations() | Creeping() | RangesDisagree() | GuessesTogether():
             return found.lidars
-        case consistency.NoSurface():
-            return tuple(found.surface.scatter_m)
         case _:
             return ()
 

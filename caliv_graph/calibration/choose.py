@@ -116,7 +116,7 @@ def choose_static(
     apart = _different(candidates, found)
     best = max(apart, key=rank)
     others = [i for i in apart if i != best]
-    same = [i for i in others if rank(i)[:2] == (True, True)]
+    same = [i for i in others if rank(i)[0] and rank(i)[1] == rank(best)[1]]
     leaves = [i for i in others if found[i].foliage and not found[best].foliage]
     worse = [i for i in others if math.isfinite(scatter[i]) and i not in [*same, *leaves]]
     of = candidates[best].found

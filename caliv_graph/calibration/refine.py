@@ -118,7 +118,8 @@ def further_refinements(sigma_range_m: float) -> int:
 
 def creeps(course: Sequence[Iteration]) -> bool:
     """Whether iterations that did not converge ended far from where they lead."""
-    if course and course[-1].way_sigmas > LONG_WAY_SIGMAS and not _is_small(course[-1]):
+    far = bool(course) and course[-1].way_sigmas > LONG_WAY_SIGMAS
+    if far and course[-1].sigmas >= STEP_SIGMAS and not _is_small(course[-1]):
         return True
     long = [last.sigmas > CREEPING_SIGMAS and not _is_small(last) for last in course[-LAST_STEPS:]]
     return 2 * sum(long) > len(long)
@@ -277,7 +278,7 @@ class _Loop:
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
     once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement since the
     shapes began; `channels` that see the targets, and sizes of their errors; `ends`: the extrinsics
-    after each iteration of the round.
+    after each iteration since then.
     """
 
     state: SolveState
@@ -330,7 +331,7 @@ class _Loop:
 
     def begin_round(self) -> None:
         """Shapes begin, and all that was found out from those before is forgotten."""
-        self.undetermined, self.fine, self.ends = None, 0, []
+        self.undetermined, self.fine = None, 0
         self.offsets_m = np.zeros_like(self.offsets_m)
         self.state.bias_sizes = UNKNOWN
         self.begin_shapes()
@@ -340,6 +341,7 @@ class _Loop:
 
         The surfels are those of beams from now on. Another `draw` begins on other points.
         """
+        self.ends = []
         _hand_weights(self.state, self.states)
         lines = linearise_clouds(self.state.problem, self.state.values)
         for shape, (R, t) in zip(self.states, self.poses_of_clouds(lines), strict=True):

@@ -27,13 +27,14 @@ from caliv_graph.calibration.open_errors import (
     RATHER_NONE,
     SIZES,
     SURELY_NONE,
+    Limit,
+    limits_by_motion,
     of_expected_size,
     open_errors,
 )
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.solve import SolveState
 from caliv_graph.calibration.variance_components import (
-    TIME_STEP,
     Component,
     Likelihood,
     SlowComponent,
@@ -252,14 +253,15 @@ def estimated(evidence: Evidence, noise: NoiseConfig, of_wheels: bool = False) -
     known = np.sum([evidence.observed.known, *stated], axis=0)
     evidence = replace(evidence, observed=replace(evidence.observed, known=known))
     levels = _white_levels(of_wheels)
-    best = _fitted(evidence, levels, names, (), None)
+    best = _fitted(evidence, levels, names, (), None, _Limits({}))
     kinds = _looked_for(noise, evidence)
+    limits = _Limits.of(evidence, kinds)
     while kinds:
-        start = _best_start(evidence, names, best, kinds)
+        start = _best_start(evidence, names, best, kinds, limits)
         if start is None:
             break
         before = [(error.kind, _start_of(error)) for error in best.errors]
-        better = _fitted(evidence, levels, names, [*before, start], best)
+        better = _fitted(evidence, levels, names, [*before, start], best, limits)
         if best.cost - better.cost < EVIDENCE:
             break
         best = better
@@ -345,8 +347,7 @@ class _Fit:
         white: (k,) sigmas of the white levels.
         factors: (J,) of the registrations of the clouds, on their level.
         errors: that are correlated over time.
-        cost: minus the log-posterior of what the LiDARs see. The motion data are no part of it: a
-            wrong level of the accelerometer looks like a slow error.
+        cost: minus the log-posterior, with what the motion data rule out.
     """
 
     white: Array
@@ -361,6 +362,7 @@ def _fitted(
     names: Sequence[str],
     slow: Sequence[tuple[str, Array]],
     start: _Fit | None,
+    limits: _Limits,
 ) -> _Fit:
     """The most likely of the `white_levels` of `names`, factors of the clouds, correlated errors.
 
@@ -379,16 +381,13 @@ def _fitted(
 
     def cost(x: Array) -> tuple[float, Array, Array]:
         value, slope, information = likelihood.cost(x)
-        told = _told_by_motion(evidence, kinds, x[at:])
-        for i in range(at, len(x)):
-            beside = x[at:] + TIME_STEP * (np.arange(at, len(x)) == i)
-            slope[i] -= (_told_by_motion(evidence, kinds, beside) - told) / TIME_STEP
-        return value - told, slope, information
+        lost, by_slow = limits.cost(kinds, x[at:])
+        slope[at:] += by_slow
+        return value + lost, slope, information
 
     found, value = maximise(cost, unknowns, np.array(first))
     white, factors = found[: len(levels)], found[len(levels) : at]
-    told = _told_by_motion(evidence, kinds, np.log(found[at:]))
-    return _Fit(white, factors, _errors_of(kinds, found[at:]), value + told)
+    return _Fit(white, factors, _errors_of(kinds, found[at:]), value)
 
 
 def _errors_of(kinds: Sequence[str], values: Array) -> tuple[CorrelatedError, ...]:
@@ -406,15 +405,28 @@ def _errors_of(kinds: Sequence[str], values: Array) -> tuple[CorrelatedError, ..
     return tuple(errors)
 
 
-def _told_by_motion(evidence: Evidence, kinds: Sequence[str], logarithms: Array) -> float:
-    """Log-likelihood that the motion data have of correlated errors, less that of none.
+@dataclass(frozen=True)
+class _Limits:
+    """What the motion data rule out of the errors of some sensors (`limits_by_motion`)."""
 
-    At the `logarithms` of the values of `_errors_of`. Over seconds an IMU knows how far fixes are
-    off; what LiDARs and map have wrong is 84 mm of them otherwise (random drive 268 of the second
-    simulator, truly 17).
-    """
-    errors = _errors_of(kinds, np.exp(logarithms))
-    return sum(motion.gain(errors) for motion in evidence.motion)
+    of_kinds: Mapping[str, Sequence[Limit]]
+
+    @classmethod
+    def of(cls, evidence: Evidence, kinds: Sequence[str]) -> _Limits:
+        """Of all kinds that are looked for."""
+        return cls({kind: limits_by_motion(evidence, kind) for kind in kinds})
+
+    def cost(self, kinds: Sequence[str], logarithms: Array) -> tuple[float, Array]:
+        """Minus a log-likelihood, and its slope, at the logarithms of sigmas and times in a row."""
+        value, slope, at = 0.0, np.zeros(len(logarithms)), 0
+        for kind in kinds:
+            time = at + len(GROUPS[kind])
+            for i, limit in enumerate(self.of_kinds[kind], start=at):
+                lost, by_sigma, by_time = limit(float(logarithms[i]), float(logarithms[time]))
+                value += lost
+                slope[[i, time]] += by_sigma, by_time
+            at = time + 1
+        return value, slope
 
 
 def _likelihood(evidence: Evidence, names: Sequence[str], kinds: Sequence[str]) -> Likelihood:
@@ -442,7 +454,7 @@ def _slow(evidence: Evidence, kind: str, time_s: float) -> list[Array]:
 
 
 def _best_start(
-    evidence: Evidence, names: Sequence[str], best: _Fit, kinds: Sequence[str]
+    evidence: Evidence, names: Sequence[str], best: _Fit, kinds: Sequence[str], limits: _Limits
 ) -> tuple[str, Array] | None:
     """Which further error explains most before anything is fitted, and with which sigmas and time.
 
@@ -453,7 +465,7 @@ def _best_start(
     logarithms = np.log(np.concatenate(so_far))
     at = len(best.white) + len(best.factors)
     least, out = _likelihood(evidence, names, before).value(logarithms), None
-    least -= _told_by_motion(evidence, before, logarithms[at:])
+    least += limits.cost(before, logarithms[at:])[0]
     for kind in kinds:
         likelihood = _likelihood(evidence, names, [*before, kind])
         for sigma in SLOW[kind].starts:
@@ -461,7 +473,7 @@ def _best_start(
                 values = np.array([sigma] * len(GROUPS[kind]) + [time_s])
                 x = np.concatenate([logarithms, np.log(values)])
                 cost = likelihood.value(x)
-                cost -= _told_by_motion(evidence, [*before, kind], x[at:])
+                cost += limits.cost([*before, kind], x[at:])[0]
                 if cost < least:
                     least, out = cost, (kind, values)
     return out

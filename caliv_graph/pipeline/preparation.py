@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -99,6 +99,14 @@ class Prepared:
     no_target: TargetError | None = None
     mistakes: tuple[str, ...] = ()
     misplaced: tuple[str, ...] = ()
+
+    def without_clouds(self, lidars: Collection[str]) -> Prepared:
+        """The same without the target's clouds of some LiDARs, and targets of fewer than two."""
+        left = [
+            replace(of, clouds=tuple(cloud for cloud in of.clouds if cloud.lidar not in lidars))
+            for of in self.observations
+        ]
+        return replace(self, observations=tuple(of for of in left if len(of.clouds) >= 2))
 
 
 def motions_of(

@@ -14,6 +14,7 @@ from caliv_graph.calibration.check import check, cloud_counts, surfaces
 from caliv_graph.calibration.choose import SAME_OBJECT_M
 from caliv_graph.calibration.estimate import estimate_with_noise
 from caliv_graph.calibration.requirements import unmet_requirements
+from caliv_graph.calibration.structure import lidars_with_structure
 from caliv_graph.calibration.structure_evidence import (
     StructureEvidence,
 )
@@ -49,12 +50,14 @@ from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
 from caliv_graph.uncertainty.consistency import (
     CONTRADICTION_SIGMAS,
+    CloudCount,
     too_many_outliers,
     without_surface,
 )
 from caliv_graph.wording.contradictions import no_surface_text, outliers_text
 from caliv_graph.wording.mounting import mistake_sentence
 from caliv_graph.wording.structure import (
+    left_out_sentence,
     nothing_sentence,
     ranges_sentence,
     wrong_target_sentence,
@@ -89,37 +92,56 @@ def calibrate(
 def _calibrate(
     recordings: Sequence[Recording], config: Config, progress: Progress, prior: Calibration | None
 ) -> CalibrationRun:
-    """Once more without the target, if what was found for one is none; see `calibrate`."""
+    """Once more without what is no target, or is none for a LiDAR; see `calibrate`."""
     # The report shows the scans as they are read; nothing is read for it.
     sampled = [SampledRecording(recording) for recording in recordings]
     read = motions_of(sampled, config, progress)
     run, named = _calibrated(sampled, config, progress, prior, read)
-    refused = no_target_of(run, config)
-    if refused is None or named:
+    refused = None if named else no_target_of(run, config)
+    left_out = elsewhere(run) if refused is None else ()
+    if refused is None and not left_out:
         return run
     again = [SampledRecording(recording) for recording in recordings]
+    names = " and ".join(f"'{count.lidar}'" for count in left_out)
+    what = f"target clouds of {names}" if left_out else "that target"
     try:
-        with progress.stage("calibrating again, without that target", None):
-            alone, _ = _calibrated(again, config, progress, prior, read, refused)
+        with progress.stage(f"calibrating again, without {what}", None):
+            alone, _ = _calibrated(again, config, progress, prior, read, refused, left_out)
     except CalivError:
         return run
     # A wrong guess or clock contradicts walls, too: then the target shows it as well.
     return run if alone.calibration.status == "inconsistent" else alone
 
 
+def elsewhere(run: CalibrationRun) -> tuple[CloudCount, ...]:
+    """LiDARs all of whose target clouds contradict the others', and that see walls.
+
+    Their clouds are of another object, or were laid on the target wrongly. What is wrong with the
+    LiDAR itself (its guess, its clock, the sign of an axis) contradicts walls as well.
+    """
+    if run.calibration.status != "inconsistent" or run.record is None:
+        return ()
+    counts = cloud_counts(run.solution, run.record.trajectories)
+    out = [of for of in counts if too_many_outliers(of) and of.outliers == of.clouds]
+    if not out or len(out) == len(counts):
+        return ()
+    known = lidars_with_structure(run.solution.structure)
+    return tuple(of for of in out if of.lidar in known)
+
+
 def no_target_of(run: CalibrationRun, config: Config) -> TargetError | None:
     """Why the object that the search found is no target; None: nothing speaks against it.
 
     Most clouds of a LiDAR lie elsewhere than the others: on the next object, or along a hedge. Or
-    they show no surface, as those of foliage.
+    none of the targets shows a surface, as foliage.
     """
     if run.calibration.status != "inconsistent" or config.target is not None:
         return None
     if not run.solution.structure or run.record is None:
         return None
     scattered = without_surface(surfaces(run.solution))
-    if scattered:
-        return TargetError(wrong_target_sentence(no_surface_text(scattered[0])))
+    if scattered and len(scattered) == len(run.solution.registrations):
+        return TargetError(wrong_target_sentence("; ".join(map(no_surface_text, scattered))))
     for count in cloud_counts(run.solution, run.record.trajectories):
         off = count.offset_vehicle
         if (
@@ -139,6 +161,7 @@ def _calibrated(
     prior: Calibration | None,
     read: tuple[dict[int, MotionData], Config, tuple[str, ...]],
     refused: TargetError | None = None,
+    left_out: Sequence[CloudCount] = (),
 ) -> tuple[CalibrationRun, bool]:
     """One statement per stage; and whether a mistake of the config was named.
 
@@ -149,6 +172,7 @@ def _calibrated(
         prior: see `calibrate`.
         read: of `motions_of`.
         refused: why the target that the search finds is not used; None: it is.
+        left_out: LiDARs whose target clouds are not used.
     """
     recordings: Sequence[Recording] = sampled
     motions, used, notes = read
@@ -157,6 +181,9 @@ def _calibrated(
     guessed = used if prior is None else starting_from(used, prior, digests, marks)
 
     prepared = prepare(recordings, guessed, motions, progress, refused)
+    if left_out:
+        prepared = prepared.without_clouds({count.lidar for count in left_out})
+        notes = (*notes, *(left_out_sentence(outliers_text(count)) for count in left_out))
     try:
         solution, trajectories = estimate_with_noise(
             prepared.observations,

@@ -32,8 +32,8 @@ PRIOR_POINTS = 50.0
 
 
 FAR_NEIGHBOURS, FAR_SIGMAS = 0.9, 1.6449
-"""Part of the pairs of neighbours that are nearer to each other than this quantile, and its size in
-standard deviations. Leaves are larger than what is between two beams: most neighbours lie on one.
+"""Quantile of the differences between neighbours, and its size in standard deviations. Leaves are
+larger than what is between two beams: most neighbours lie on one.
 Of the pairs of a chair, less than a tenth have an edge between them."""
 
 FEWEST_NEIGHBOURS = 50
@@ -205,9 +205,12 @@ def scatter_of_neighbours(stack: CloudStack, slides_m: Array, explained: Array) 
     """
     own = np.flatnonzero(explained > ON_TARGET)
     out = np.full(stack.lidars, math.nan)
-    if len(own) < FEWEST_NEIGHBOURS:
+    if len(own) < 2:
         return out
     apart = np.column_stack([stack.beams[own], OTHER_CLOUD * stack.cloud[own]])
+    # Drivers publish both returns of a beam, which may be one.
+    apart, first = np.unique(apart, axis=0, return_index=True)
+    own = own[first]
     nearest = own[np.asarray(cKDTree(apart).query(apart, 2)[1])[:, 1]]
     together = stack.cloud[own] == stack.cloud[nearest]
     own, nearest = own[together], nearest[together]

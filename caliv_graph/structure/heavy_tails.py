@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from caliv_graph.products import Array
@@ -42,3 +44,9 @@ def told_by_few(number: float) -> float:
     It has as many degrees of freedom, and two.
     """
     return 1.0 + 2.0 / (LEAST_TOLD + number)
+
+
+def sigma_of_few(sigma: float, number: float, usual: float) -> float:
+    """A sigma that so many errors tell; the usual one counts as one more."""
+    variance = (usual**2 + number * sigma**2) / (1.0 + number)
+    return math.sqrt(variance * told_by_few(number))

@@ -15,7 +15,7 @@ from caliv_graph.config.range_errors import RangeErrors, SizePrior, size_weights
 from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.structure.beams import BeamErrors, mean_rows, parts_of
 from caliv_graph.structure.bends import BENDS, USUAL_PER_M
-from caliv_graph.structure.heavy_tails import FREEDOM, heavy_tailed, told_by_few
+from caliv_graph.structure.heavy_tails import FREEDOM, heavy_tailed, sigma_of_few
 from caliv_graph.structure.layout import BIASES, Layout, Nuisances
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.residuals import Geometry
@@ -199,9 +199,7 @@ def fitted_noise(
     of_lidar = nuisances.of_lidar(sightings.strip, lidar, level) ** 2
     point = of_points + of_lidar
     told = free * float(weights.sum())
-    variance = common_sigma(offsets, point, free) ** 2
-    variance = (SIGHTING_USUAL_M**2 + told * variance) / (1.0 + told) * told_by_few(told)
-    total_sigma = math.sqrt(variance)
+    total_sigma = sigma_of_few(common_sigma(offsets, point, free), told, SIGHTING_USUAL_M)
     limit = 3.0 * np.sqrt(point + total_sigma**2)
     shared = _shared_variance(np.clip(offsets, -limit, limit), group) / free
     shared = float(np.clip(shared, LEAST_M**2, 0.9 * total_sigma**2 + LEAST_M**2))
@@ -210,7 +208,8 @@ def fitted_noise(
     total = np.bincount(sightings.strip, square, layout.strips)
     count = np.bincount(sightings.strip, minlength=layout.strips)
     one = len(np.unique(views.of_scan)) <= layout.lidars
-    # The estimate takes up the rest of the offsets, which then seem small.
+    # The estimate takes up the rest of the offsets, which then seem small. `ONE_VIEW_M` bounds them
+    # where there is one place.
     left = 1.0 if one else free
     own = (OWN_STRIP * common**2 + left * total) / (OWN_STRIP + left * count)
     view = views.of_scan[sightings.scan] * layout.strips + sightings.strip

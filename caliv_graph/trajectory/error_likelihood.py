@@ -95,20 +95,6 @@ class ErrorLikelihood:
         wider = 1.0 + variance * np.maximum(values, 0.0)
         return np.asarray(0.5 * (variance * pull / wider - np.log(wider)).sum(axis=1))
 
-    def gain(self, errors: Sequence[CorrelatedError]) -> float:
-        """Log-likelihood of errors of as many sensors, less that of none."""
-        mine = [error for error in errors if error.kind in self.kinds]
-        if not mine:
-            return 0.0
-        halves = [self._half(error) for error in mine]
-        L = scipy.linalg.block_diag(*(half for _, half in halves))
-        at = np.concatenate([columns for columns, _ in halves])
-        wider = L.T @ self.information[np.ix_(at, at)] @ L
-        wider[np.diag_indices(len(at))] += 1.0
-        root = scipy.linalg.cholesky(wider, lower=True, check_finite=False)
-        pull = scipy.linalg.solve_triangular(root, L.T @ self.gradient[at], lower=True)
-        return float(0.5 * pull @ pull - np.log(np.diag(root)).sum())
-
     def _half(self, error: CorrelatedError) -> tuple[IntArray, Array]:
         """Coordinates of an error, and a square root of its covariance."""
         apart = np.abs(self.stamps_ns[:, None] - self.stamps_ns) * 1e-9

@@ -350,6 +350,7 @@ class Creeping:
         shift_m: likewise.
         sigmas: of the steps of all LiDARs in it, in joint standard deviations.
         lidars: that see a target.
+        way_sigmas: how far they have come in the last ten, likewise.
     """
 
     iterations: int
@@ -357,6 +358,7 @@ class Creeping:
     shift_m: float
     sigmas: float
     lidars: tuple[str, ...]
+    way_sigmas: float = 0.0
 
 
 @dataclass(frozen=True)

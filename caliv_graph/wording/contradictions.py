@@ -95,11 +95,12 @@ def _creeping(found: Creeping, led: bool) -> str:
         ". Give better initial guesses (lidars.<name>.initial), a target with edges that all "
         "LiDARs see, or structure around it"
     )
+    way = f", and by {found.way_sigmas:.0f} sigma in the last ten" if found.way_sigmas else ""
     return (
         f"the registration has not come to rest: at the end of {found.iterations} iterations "
         f"LiDARs still moved by up to {1e3 * found.turn_rad:.2f} mrad and "
-        f"{1e3 * found.shift_m:.1f} mm ({found.sigmas:.1f} sigma) in one; they may be off by many "
-        f"of their sigmas{'' if led else advice}"
+        f"{1e3 * found.shift_m:.1f} mm ({found.sigmas:.1f} sigma) in one{way}; they may be off by "
+        f"many of their sigmas{'' if led else advice}"
     )
 
 
@@ -107,11 +108,11 @@ def no_surface_text(found: NoSurface) -> str:
     """What the clouds of a target without a surface show."""
     told_m = found.surface.told_m
     scatter = ", ".join(
-        f"'{name}' by {1e3 * scatter_m:.0f} mm for {1e3 * told_m[name]:.0f}"
+        f"'{name}' {1e3 * scatter_m:.0f} mm with a noise of {1e3 * told_m[name]:.0f} mm"
         for name, scatter_m in found.surface.scatter_m.items()
     )
     return (
-        f"{found.target}: its clouds show no surface, as those of a bush: neighbouring points "
+        f"the clouds of {found.target} show no surface, as those of a bush do: neighbouring points "
         f"scatter along the beams by far more than the noise of the ranges ({scatter})"
     )
 

@@ -22,6 +22,14 @@ def wrong_target_sentence(contradiction: str) -> str:
     )
 
 
+def left_out_sentence(contradiction: str) -> str:
+    """The warning that a LiDAR's clouds of the target are not used; what they say."""
+    return (
+        f"{contradiction}, and walls do not: these clouds are not used. They may be of another "
+        "object, or too sparse to be laid on the target"
+    )
+
+
 def nothing_sentence(what: str, structure: str) -> str:
     """The error where neither target nor structure tells anything; why, of each."""
     return f"{what}. Structure does not replace it: {structure}"

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from caliv_graph.calibration.choose import (
+    Agreement,
+    agreement,
     choose_static,
     displaced,
     displaced_or_misguessed,
@@ -19,7 +21,14 @@ from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config, SolveConfig, TargetRegion
 from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.errors import TargetError
-from caliv_graph.products import Array, IntArray, TargetCloud, TargetObservation, Trajectory
+from caliv_graph.products import (
+    Array,
+    IntArray,
+    Surface,
+    TargetCloud,
+    TargetObservation,
+    Trajectory,
+)
 from caliv_graph.scenario.drive_models import FigureEightDrive
 from caliv_graph.scenario.drives import make_drive
 from caliv_graph.targets.cloud.choice import TriedCandidate
@@ -120,13 +129,29 @@ def test_of_two_static_ones_the_better_seen_wins_and_the_other_is_named() -> Non
     assert "Other static objects fit too: (10.5, -2.0) 0.5 m wide 1.0 m high" in reason
 
 
-def test_a_bush_loses_however_well_it_is_seen() -> None:
-    bush = candidate(observation(WALKER, bush=True), WALKER, score=90.0)
-    chair = candidate(observation(CHAIR), CHAIR, score=20.0)
-    choice = choose_static([bush, chair], trajectory(), CONFIG)
-    assert choice.index == 1
+def test_the_clouds_of_a_bush_show_no_surface() -> None:
+    bush, chair = observation(WALKER, bush=True), observation(CHAIR)
+    assert agreement(candidate(bush, WALKER, 1.0), trajectory(), CONFIG).foliage
+    assert not agreement(candidate(chair, CHAIR, 1.0), trajectory(), CONFIG).foliage
+
+
+@pytest.mark.parametrize("bushes", [(True, False), (True, True), (False, False)])
+def test_a_bush_loses_however_well_it_is_seen(
+    bushes: tuple[bool, bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = (Surface({"front": 0.05 if of else 0.01}, {"front": 0.01}) for of in bushes)
+    nothing = TargetObservation(0, "target", CHAIR, ())
+    seen = candidate(nothing, WALKER, score=90.0), candidate(nothing, CHAIR, score=20.0)
+    found = iter([Agreement(0.01, surface=first), Agreement(0.02, surface=second)])
+    monkeypatch.setattr("caliv_graph.calibration.choose.agreement", lambda *_: next(found))
+    choice = choose_static(seen, trajectory(), CONFIG)
     (reason,) = choice.reasons
-    assert reason.startswith("chosen because others show no surface, as bushes do: (10.5, -2.0)")
+    if bushes == (True, False):
+        assert choice.index == 1
+        assert reason.startswith("chosen because others show no surface, as bushes do: (10.5, -2.0")
+    else:
+        assert choice.index == 0
+        assert "Other static objects fit too: (12.1, 0.0)" in reason
 
 
 def test_two_proposals_of_one_object_are_one() -> None:

@@ -157,6 +157,7 @@ def test_what_does_not_move_does_not_creep() -> None:
 def test_small_steps_that_lead_far_creep(way_sigmas: float, on_its_way: bool) -> None:
     steps = [Iteration(3e-4, 2e-3, 0.45, 0.1, way_sigmas=way_sigmas)] * 30
     assert creeps(steps) == on_its_way
+    assert not creeps([*steps, replace(steps[0], sigmas=0.09)])
     assert not creeps([replace(step, turn_rad=1e-5, shift_m=1e-4) for step in steps])
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from caliv_graph.calibration import sensor_noise
 from caliv_graph.calibration.evidence import Evidence, motion_evidence
+from caliv_graph.calibration.open_errors import limits_by_motion
 from caliv_graph.calibration.problem import HEAVE_SIGMA_M
 from caliv_graph.calibration.sensor_noise import (
     LEVELS,
@@ -32,6 +33,9 @@ from tests.trajectory.test_variances import base, recorded, shifted, smoothed
 POSES = 16
 STEPS = 48
 STAMPS = np.arange(STEPS) * 500_000_000
+H = 1e-4
+NEAR = ((math.exp(H), 1.0), (1.0, math.exp(H)))
+"""Factors on a sigma and on a time, for slopes by their logarithms."""
 
 
 def gain() -> Array:
@@ -139,11 +143,38 @@ def test_an_error_that_the_motion_data_rule_out_is_none_of_the_fixes() -> None:
     small = 0.002 * np.random.default_rng(1).standard_normal(size)
     motion = ErrorLikelihood(("gnss",), STAMPS, known, known @ small)
     within = replace(made, motion=[motion], sensor_sigmas={"gnss": np.full(3, 0.01)})
-    found = estimated(within, NoiseConfig())
-    assert all(error.sigmas[0] < 0.005 for error in found.correlated)
-    silent = replace(motion, information=np.zeros((size, size)), gradient=np.zeros(size))
-    (as_before,) = estimated(replace(made, motion=[silent]), NoiseConfig()).correlated
-    assert as_before.sigmas == pytest.approx(alone.sigmas, rel=0.05)
+    for error in estimated(within, NoiseConfig()).correlated:
+        assert error.sigmas[0] < 0.005
+
+
+@pytest.mark.parametrize("swing_m", [0.0, 1.0])
+def test_motion_data_ask_for_no_error_that_the_lidars_do_not_show(swing_m: float) -> None:
+    """A wrong level of the accelerometer looks like a slow error of any size."""
+    made = evidence(2, 5e-3, CorrelatedError("gnss", (0.02, 0.02, 0.015), 10.0))
+    (alone,) = estimated(made, NoiseConfig()).correlated
+    size = 3 * STEPS
+    swing = np.tile(swing_m * np.sin(0.2 * np.arange(STEPS)), 3)
+    weak = np.eye(size)
+    motion = ErrorLikelihood(("gnss",), STAMPS, weak, weak @ swing)
+    (error,) = estimated(replace(made, motion=[motion]), NoiseConfig()).correlated
+    assert error.sigmas == pytest.approx(alone.sigmas, rel=0.1)
+
+
+def test_what_motion_data_rule_out_grows_with_the_size_and_has_the_right_slope() -> None:
+    size = 3 * STEPS
+    known = np.diag(np.full(size, 0.01**-2.0))
+    motion = ErrorLikelihood(("gnss",), STAMPS, known, np.zeros(size))
+    only = replace(evidence(0, 5e-3, None), motion=[motion, motion])
+    horizontal, vertical = limits_by_motion(only, "gnss")
+    error = CorrelatedError("gnss", (0.02, 0.02, 0.0), 10.0)
+    (gain,) = motion.gains(error, np.ones(1))
+    lost, by_sigma, by_time = horizontal(math.log(0.02), math.log(10.0))
+    assert lost == pytest.approx(-2.0 * gain, rel=0.01)
+    more, longer = (horizontal(math.log(0.02 * a), math.log(10.0 * b))[0] for a, b in NEAR)
+    assert [by_sigma, by_time] == pytest.approx([(more - lost) / H, (longer - lost) / H], rel=0.02)
+    assert horizontal(math.log(1e-5), math.log(10.0))[0] == pytest.approx(0.0, abs=1e-3)
+    assert 0.0 < vertical(math.log(0.02), math.log(10.0))[0] < lost
+    assert limits_by_motion(replace(only, motion=[]), "gnss") == []
 
 
 def test_an_error_of_the_heading_is_none_of_roll_and_pitch() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import Array, IntArray
-from caliv_graph.structure.heavy_tails import heavy_tailed, told_by_few
+from caliv_graph.structure.heavy_tails import heavy_tailed, sigma_of_few, told_by_few
 from caliv_graph.structure.layout import Nuisances
 from caliv_graph.structure.residuals import PLANE_ROWS, Geometry
 from caliv_graph.structure.sightings import Sightings
@@ -159,6 +159,10 @@ def test_sizes_that_few_strips_tell_are_larger() -> None:
     """The variance of a t distribution: of `n + 2` degrees of freedom, `1 + 2 / n` times."""
     assert told_by_few(1.0) == pytest.approx(3.0, rel=0.02)
     assert told_by_few(200.0) == pytest.approx(1.01, rel=1e-4)
+
+    assert sigma_of_few(2e-4, 0.0, 0.002) == pytest.approx(0.002 * math.sqrt(101.0))
+    assert sigma_of_few(2e-4, 1.0, 0.002) == pytest.approx(0.00245, rel=0.02)
+    assert sigma_of_few(2e-4, 4000.0, 0.002) == pytest.approx(2e-4, rel=0.02)
 
     def common(strips: int, told: float) -> float:
         """The sigma of strips whose errors are 2 mm, of which the data tell a part."""

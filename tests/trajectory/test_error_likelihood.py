@@ -62,10 +62,6 @@ def test_it_is_the_likelihood_of_the_longer_chain(monkeypatch: pytest.MonkeyPatc
     alone = longer()
     assert found.gains(fixes, np.array([1.0]))[0] == pytest.approx(alone - longer(fixes), abs=2e-3)
     assert found.gains(turns, np.ones(2))[1] == pytest.approx(alone - longer(turns), abs=2e-3)
-    assert found.gain([turns]) == pytest.approx(found.gains(turns, np.ones(1))[0])
-    both = found.gain([turns, fixes])
-    assert both == pytest.approx(alone - longer(fixes, turns), abs=2e-3)
-    assert found.gain([fixes, turns]) == pytest.approx(both)
     twice = CorrelatedError("gnss", (0.06, 0.04, 0.02), 1.5)
     beside = found.given([turns]).gains(fixes, np.array([2.0, 0.0]))
     assert beside[0] == pytest.approx(longer(turns) - longer(twice, turns), abs=2e-3)
@@ -142,4 +138,3 @@ def test_kinds_that_a_drive_has_not_say_nothing() -> None:
 
     error = CorrelatedError("gnss", (1.0, 1.0, 1.0), 5.0)
     assert none.given([error]).gains(error, np.ones(2)).tolist() == [0.0, 0.0]
-    assert none.gain([error]) == none.gain([]) == 0.0

@@ -121,6 +121,8 @@ def test_a_registration_that_has_not_come_to_rest_says_how_it_moves() -> None:
         "see, or structure around it"
     )
     assert contradiction_sentence(found, led=True).endswith("many of their sigmas")
+    slow = contradiction_sentence(replace(found, sigmas=0.4, way_sigmas=3.7))
+    assert "(0.4 sigma) in one, and by 4 sigma in the last ten; they may" in slow
 
 
 def test_extrinsics_that_differ_come_with_their_size() -> None:

@@ -625,6 +625,7 @@ class Surface:
     Attributes:
         scatter_m: LiDAR -> scatter of the distances of neighbouring points of a scan from the
             surfels, along the beams, 1 sigma, metres. Those of a cloud that lies wrong are alike.
+            Of LiDARs with enough points.
         told_m: LiDAR -> noise of its ranges as it was known before.
     """
 

@@ -49,7 +49,7 @@ it at 0.6 to 0.8."""
 LIMITED_SIGMAS = np.geomspace(1e-5, 30.0, 60)
 LIMITED_TIMES_S = np.geomspace(2.0, 300.0, 8)
 """Sigmas (rad or m) and correlation times at which the motion data are asked for what they rule
-out; between them it is smooth."""
+out; between them it is smooth. All that `sensor_noise.SLOW` and `TIME` allow lies within."""
 
 Limit = Callable[[float, float], tuple[float, float, float]]
 """Logarithms of a sigma and a time -> how much less likely the motion data have such an error than
@@ -156,7 +156,7 @@ def limits_by_motion(evidence: Evidence, kind: str) -> list[Limit]:
 def _limit(motion: Sequence[ErrorLikelihood], kind: str, axes: Sequence[int]) -> Limit:
     from scipy.interpolate import RectBivariateSpline  # not at start-up
 
-    unit = np.isin(np.arange(AXES), axes).astype(float)
+    unit = _along(axes, np.ones(AXES))
     gain = np.array(
         [
             sum(of.gains(_error(kind, unit, time_s), LIMITED_SIGMAS) for of in motion)
@@ -177,7 +177,12 @@ def _limit(motion: Sequence[ErrorLikelihood], kind: str, axes: Sequence[int]) ->
 def _groups(evidence: Evidence, kind: str) -> list[Array]:
     """White sigmas (3,) along the map's axes for each group of axes, zero along others."""
     white = evidence.sensor_sigmas[kind]
-    return [np.where(np.isin(np.arange(AXES), axes), white, 0.0) for axes in GROUPS[kind]]
+    return [_along(axes, white) for axes in GROUPS[kind]]
+
+
+def _along(axes: Sequence[int], sigmas: Array) -> Array:
+    """Sigmas (3,) along some axes, zero along others."""
+    return np.where(np.isin(np.arange(AXES), axes), sigmas, 0.0)
 
 
 def _summary(kind: str, groups: Sequence[Array], sizes: Array, gain: Array) -> OpenError:

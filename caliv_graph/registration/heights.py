@@ -33,8 +33,8 @@ PRIOR_POINTS = 50.0
 
 FAR_NEIGHBOURS, FAR_SIGMAS = 0.9, 1.6449
 """Quantile of the differences between neighbours, and its size in standard deviations. Leaves are
-larger than what is between two beams: most neighbours lie on one.
-Of the pairs of a chair, less than a tenth have an edge between them."""
+larger than what is between two beams: most neighbours lie on one. Of the pairs of a chair, less
+than a tenth have an edge between them."""
 
 FEWEST_NEIGHBOURS = 50
 """Pairs of neighbours that tell the scatter of a LiDAR's points."""

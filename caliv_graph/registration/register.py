@@ -295,13 +295,11 @@ class JointRegistration:
         """Whether the clouds show a surface; None before annealing has reached the noise."""
         if not self.finest or self._slides is None:
             return None
-        scatter_m = scatter_of_neighbours(self.clouds, *self._slides)
-        told_m = np.sqrt(self._configured.range_m2)
-        known = np.isfinite(scatter_m)
-        names = [name for name, has in zip(self._names, known, strict=True) if has]
+        scatter_m = scatter_of_neighbours(self.clouds, *self._slides).tolist()
+        told_m = np.sqrt(self._configured.range_m2).tolist()
         return Surface(
-            dict(zip(names, scatter_m[known].tolist(), strict=True)),
-            dict(zip(names, told_m[known].tolist(), strict=True)),
+            {n: of for n, of in zip(self._names, scatter_m, strict=True) if math.isfinite(of)},
+            dict(zip(self._names, told_m, strict=True)),
         )
 
     def _noise_now(self) -> HeightNoise:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from caliv_graph.common.statistics import MAD
 from caliv_graph.geometry.se3 import skew
 from caliv_graph.products import Array, IntArray
 from caliv_graph.registration.centring import Middles
@@ -34,9 +35,6 @@ FARTHEST = 3.0
 
 STEPS = 8
 """Gauss-Newton steps; the problem is almost linear."""
-
-MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute value."""
 
 
 def placed_by_motion(

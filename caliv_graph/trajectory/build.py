@@ -15,7 +15,7 @@ import numpy as np
 
 from caliv_graph.conventions import key_bias, key_imu, key_velocity, key_yaw_bias
 from caliv_graph.geometry.se3 import stack
-from caliv_graph.products import IntArray
+from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.antennas import NodeDirections
 from caliv_graph.trajectory.factors import (
     baseline_factor,
@@ -211,14 +211,21 @@ def _add_orientations(
         graph.add("prior", gtsam.PriorFactorVector(key_yaw_bias(), np.zeros(1), noise))
 
 
+def velocity_roots(data: SmootherInput, velocities: NodeVelocities) -> Array:
+    """(m, 3, 3) what whitens residuals of velocities at nodes, imu axes.
+
+    The first row is what the forward velocity says, along the axis that it was measured along: with
+    the root of a covariance it would be as uncertain as what odometry does not measure.
+    """
+    R_twist_imu = data.T_vehicle_twist.between(data.T_vehicle_imu).rotation().matrix()
+    information = np.linalg.inv(R_twist_imu @ velocities.cov @ R_twist_imu.T)
+    return np.asarray(np.swapaxes(np.linalg.cholesky(information), 1, 2) @ R_twist_imu)
+
+
 def _add_velocities(
     graph: TrajectoryGraph, data: SmootherInput, velocities: NodeVelocities
 ) -> None:
-    # The first row is what the forward velocity says, along the axis that it was measured along:
-    # with the root of a covariance it would be as uncertain as what odometry does not measure.
-    R_twist_imu = data.T_vehicle_twist.between(data.T_vehicle_imu).rotation().matrix()
-    information = np.linalg.inv(R_twist_imu @ velocities.cov @ R_twist_imu.T)
-    roots = np.swapaxes(np.linalg.cholesky(information), 1, 2) @ R_twist_imu
+    roots = velocity_roots(data, velocities)
     for k, i in enumerate(velocities.nodes.tolist()):
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(roots[k], False)
         factor = velocity_factor(

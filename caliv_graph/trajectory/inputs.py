@@ -12,7 +12,7 @@ import numpy as np
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
-from caliv_graph.products import Array, ImuSamples, MotionData
+from caliv_graph.products import Array, ImuSamples, IntArray, MotionData
 from caliv_graph.trajectory.antennas import Baselines, Headings, directions_of
 from caliv_graph.trajectory.gnss import (
     Positions,
@@ -21,7 +21,7 @@ from caliv_graph.trajectory.gnss import (
     shared_by_rough,
 )
 from caliv_graph.trajectory.imu import Inertial, clean_inertial
-from caliv_graph.trajectory.measurements import rotations_of, usable_orientations
+from caliv_graph.trajectory.measurements import NO_VELOCITIES, rotations_of, usable_orientations
 from caliv_graph.trajectory.noise import (
     ImuNoise,
     imu_noise,
@@ -90,6 +90,7 @@ class SmootherInput:
             `late_ns` is beyond it. None: nothing says that they are late.
         slow_orientation_rad: 1 sigma of errors of the orientations at a node beside their noise,
             which hardly change from node to node.
+        slipped: (k,) indices of velocities that are left out (`slipping.py`).
     """
 
     name: str
@@ -117,6 +118,7 @@ class SmootherInput:
     late_ns: Mapping[str, int] = field(default_factory=dict)
     found_late_s: tuple[float, float] | None = None
     slow_orientation_rad: float = 0.0
+    slipped: IntArray = field(default_factory=lambda: NO_VELOCITIES)
 
     def late_s(self, clock: str) -> float:
         """Stamps of a sensor as they were read less true times, seconds."""

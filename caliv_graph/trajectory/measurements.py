@@ -19,6 +19,8 @@ from caliv_graph.trajectory.imu import DeadReckoning, exp_so3, interpolate, log_
 from caliv_graph.trajectory.noise import ImuNoise
 from caliv_graph.trajectory.wheels import UNMEASURED_M_S
 
+NO_VELOCITIES: IntArray = np.zeros(0, np.int64)
+
 SAMPLES_AT_A_TIME = 16_384
 """Of the IMU, whose orientations are carried to their nodes at once: 16 MB."""
 
@@ -198,6 +200,7 @@ def velocities_at_nodes(
     late_ns: int = 0,
     slip_s2_m: float = 0.0,
     alone: BoolArray | None = None,
+    left_out: IntArray = NO_VELOCITIES,
 ) -> NodeVelocities | None:
     """Averages the velocities around each node; None if there are none.
 
@@ -205,9 +208,10 @@ def velocities_at_nodes(
     over true ones, `late_ns` the stamps less the true times. The lever to the IMU enters with the
     gyroscope's rate and its noise. `slip_s2_m` is the side slip of an axle, radians per m/s^2 of
     lateral acceleration, to the outside of a curve. `alone` (n,) are the messages of which only the
-    forward velocity is measured; None: none.
+    forward velocity is measured; None: none. `left_out` (k,) are indices of messages.
     """
-    usable = np.isfinite(twist.velocity).all(axis=1)
+    usable = np.asarray(np.isfinite(twist.velocity).all(axis=1))
+    usable[left_out] = False
     usable &= (twist.stamps_ns >= nodes_ns[0]) & (twist.stamps_ns <= nodes_ns[-1])
     if not usable.any():
         return None

@@ -103,6 +103,7 @@ def carry_to_nodes(
             0 if data.wheels is None else imu_late,
             data.axle_slip,
             forward_alone(data.motion.twist) if data.speed_alone else None,
+            data.slipped,
         )
     headings = baselines = None
     if data.headings is not None and "heading" in kinds:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from caliv_graph.common.statistics import MAD
 from caliv_graph.config.heading import HeadingAxes
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
@@ -272,7 +273,7 @@ def _robust(A: Array, y: Array, prior_sigma: Array) -> tuple[Array, Array]:
             np.linalg.lstsq(normal + prior, (A * weight[:, None]).T @ y / OVERLAP)[0], np.float64
         )
         left = y - A @ found
-        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+        scale = max(MAD * float(np.median(np.abs(left))), 1e-9)
         weight = np.clip(1.0 - (left / (4.685 * scale)) ** 2, 0.0, None) ** 2
         # The prior in units of the scatter, which is known after the first round.
         prior = scale**2 * np.diag(1.0 / prior_sigma**2)

@@ -31,13 +31,9 @@ from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.noise import configured_errors
-from caliv_graph.trajectory.outliers import (
-    Robust,
-    dropped_warnings,
-    lost_fixes,
-    solve_without_outliers,
-)
+from caliv_graph.trajectory.outliers import Robust, dropped_warnings, lost_fixes
 from caliv_graph.trajectory.parameters import GYROSCOPE, UncertainParameter
+from caliv_graph.trajectory.slipping import slip_warnings, solve_without_slips
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import (
     ROUGH_TOLERANCE,
@@ -88,7 +84,7 @@ def smooth_trajectory(
     nodes = place_nodes(data.inertial, wanted)
     data, states, parameters = _begun_at(earlier, data, nodes) or _begun(data, nodes)
     errors = errors_in(data, [*configured_errors(config), *correlated])
-    robust, estimate = solve_without_outliers(data, nodes, states)
+    robust, estimate = solve_without_slips(data, nodes, states)
     warnings += [*lines, *robust.warnings]
     found = estimate.states
     wrong = (
@@ -99,7 +95,7 @@ def smooth_trajectory(
     if wrong:
         data = scaled(robust.data, wrong)
         del estimate  # its graph
-        robust, estimate = solve_without_outliers(data, nodes, found)
+        robust, estimate = solve_without_slips(data, nodes, found)
         warnings += robust.warnings
     positions = robust.data.positions
     # Handed over: a second graph beside it would be as large.
@@ -120,7 +116,8 @@ def smooth_trajectory(
     # Only those at wanted stamps are asked for: the memory of the others grows with the drive.
     kept = np.unique(nearest_node(nodes, wanted)) if len(wanted) else None
     chain = last.chain if kept is None else last.chain.only(kept)
-    warnings += [*dropped_warnings(robust), *_bias_warnings(data, estimate.states)]
+    warnings += [*dropped_warnings(robust), *slip_warnings(data)]
+    warnings += _bias_warnings(data, estimate.states)
     warnings += _gyroscope_warnings(data, last.settled.parameters)
     return SmoothedTrajectory(
         trajectory=_at_wanted(data, wanted, nodes, estimate.states, last.cov),
@@ -191,7 +188,7 @@ def _settled(
     if late := with_late_clock(settled):
         settled = settle(settled.data, nodes, settled.estimate, robust.dropped, kernel, late)
         # Fixes that the wrong time had put beside the path.
-        robust, estimate = solve_without_outliers(settled.data, nodes, settled.estimate.states)
+        robust, estimate = solve_without_slips(settled.data, nodes, settled.estimate.states)
         late = settled.parameters
         settled = settle(robust.data, nodes, estimate, robust.dropped, kernel, late)
     return robust, settled

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caliv_graph.products import Array, MotionData
+from caliv_graph.products import IntArray, MotionData
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.motions import stamps
@@ -18,17 +18,13 @@ BEGIN_S = 10.0
 
 def slipping(motion: MotionData, seconds: float, m_s: float) -> MotionData:
     """The wheels turn faster than the vehicle goes, for some seconds."""
-    return replace(motion, twist=replace(motion.twist, velocity=_faster(motion, seconds, m_s)))
-
-
-def _faster(motion: MotionData, seconds: float, m_s: float) -> Array:
     assert motion.twist is not None
     velocity = motion.twist.velocity.copy()
     velocity[during(motion, seconds), 0] += m_s
-    return velocity
+    return replace(motion, twist=replace(motion.twist, velocity=velocity))
 
 
-def during(motion: MotionData, seconds: float) -> Array:
+def during(motion: MotionData, seconds: float) -> IntArray:
     assert motion.twist is not None
     at_s = (motion.twist.stamps_ns - motion.twist.stamps_ns[0]) * 1e-9
     return np.flatnonzero((at_s >= BEGIN_S) & (at_s < BEGIN_S + seconds))

@@ -13,6 +13,11 @@ SPEED_SCALE_SIGMA = 0.02
 """Tyres lose 1 to 2 % of their radius with pressure, load and wear."""
 
 
+DELAY_SIGMA_S, DELAY_SIGMA_BESIDE_IMU_S = 0.01, 0.05
+"""A vehicle's bus stamps speeds tens of milliseconds after the wheels were read. Without an IMU
+nothing but LiDARs and fixes tells how late: who drives so is asked for clocks that agree."""
+
+
 class WheelsConfig(Section):
     """The wheels of a vehicle, as a source of its motion; with an IMU their scale alone counts."""
 
@@ -43,10 +48,10 @@ class WheelsConfig(Section):
         description="1 sigma of the scale of the speeds, measured over true, less one; absent: "
         "0.02, exact beside an IMU where lateral velocities are measured, too; 0: exact",
     )
-    time_offset_sigma_s: NonNegative = Field(
-        0.01,
-        description="seconds, sigma of the stamps of the speeds less the true times, in the clock "
-        "of the LiDARs, where there is no IMU; 0: exact",
+    time_offset_sigma_s: NonNegative | None = Field(
+        None,
+        description="seconds, sigma of the stamps of the speeds less the true times; absent: 0.05 "
+        "beside an IMU, 0.01 without one; 0: exact",
     )
 
     def rotation_sigmas_rad(self) -> tuple[float, float, float]:
@@ -54,6 +59,12 @@ class WheelsConfig(Section):
         deg = self.rotation_sigma_deg
         x, y, z = deg if isinstance(deg, tuple) else (deg,) * 3
         return math.radians(x), math.radians(y), math.radians(z)
+
+    def delay_sigma_s(self, beside_imu: bool) -> float:
+        """Sigma of the stamps of the speeds less the true times, seconds; 0: they are exact."""
+        if self.time_offset_sigma_s is None:
+            return DELAY_SIGMA_BESIDE_IMU_S if beside_imu else DELAY_SIGMA_S
+        return self.time_offset_sigma_s
 
     def scale_sigma(self, of_wheels: bool) -> float | None:
         """Sigma of the scale of the speeds; None: it is exact."""

@@ -46,7 +46,7 @@ MAX_TILT_DISAGREEMENT_RAD = math.radians(20.0)
 accelerations average to a few degrees; a wrong axis convention is 90 or 180."""
 
 
-IMU_CLOCK, GNSS_CLOCK = "imu", "gnss"
+IMU_CLOCK, GNSS_CLOCK, TWIST_CLOCK = "imu", "gnss", "twist"
 """Clocks of the sensors of the motion. Without an IMU the first is that of the wheels, which stand
 in for it; directions by antennas have the second."""
 
@@ -83,14 +83,17 @@ class SmootherInput:
         baselines: the same as vectors between two antennas.
         heading_yaw: direction of that baseline in the vehicle frame, to the left of x, radians.
         second_arm: (3,) the second antenna in the vehicle frame, metres.
-        late_ns: sensor (`IMU_CLOCK`, `GNSS_CLOCK`) -> stamps less true times in the clock of the
-            LiDARs; absent: 0. Stamps of `inertial` are free of it, all others as they were read.
+        late_ns: sensor (`IMU_CLOCK`, `GNSS_CLOCK`, `TWIST_CLOCK`) -> stamps less true times in the
+            clock of the LiDARs; absent: 0. Stamps of `inertial` are free of it, all others as they
+            were read. Velocities without an IMU have `IMU_CLOCK`.
         found_late_s: how late the fixes are and its sigma, found before smoothing
             (`late_fixes.py`). Stamps of positions, headings and baselines are free of it, and
             `late_ns` is beyond it. None: nothing says that they are late.
         slow_orientation_rad: 1 sigma of errors of the orientations at a node beside their noise,
             which hardly change from node to node.
         slipped: (k,) indices of velocities that are left out (`slipping.py`).
+        about_late_ns: how late velocities beside an IMU are, about: each belongs to the node that
+            is nearest to its stamp less this, also while `late_ns` is estimated.
     """
 
     name: str
@@ -119,6 +122,7 @@ class SmootherInput:
     found_late_s: tuple[float, float] | None = None
     slow_orientation_rad: float = 0.0
     slipped: IntArray = field(default_factory=lambda: NO_VELOCITIES)
+    about_late_ns: int = 0
 
     def late_s(self, clock: str) -> float:
         """Stamps of a sensor as they were read less true times, seconds."""
@@ -155,6 +159,12 @@ class SmootherInput:
     def speed_scale_sigma(self) -> float | None:
         """Of the scale of the velocities; None: it is exact."""
         return self.config.wheels.scale_sigma(self.speed_alone or self.wheels is not None)
+
+    @property
+    def speeds_delay_sigma_s(self) -> float:
+        """Of the stamps of velocities beside an IMU; 0: they are exact, or there are none."""
+        beside = self.wheels is None and self.motion.twist is not None
+        return self.config.wheels.delay_sigma_s(beside) if beside else 0.0
 
     @property
     def gyroscope_scale_sigma(self) -> float | None:

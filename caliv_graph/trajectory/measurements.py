@@ -201,6 +201,7 @@ def velocities_at_nodes(
     slip_s2_m: float = 0.0,
     alone: BoolArray | None = None,
     left_out: IntArray = NO_VELOCITIES,
+    about_late_ns: int = 0,
 ) -> NodeVelocities | None:
     """Averages the velocities around each node; None if there are none.
 
@@ -208,16 +209,17 @@ def velocities_at_nodes(
     over true ones, `late_ns` the stamps less the true times. The lever to the IMU enters with the
     gyroscope's rate and its noise. `slip_s2_m` is the side slip of an axle, radians per m/s^2 of
     lateral acceleration, to the outside of a curve. `alone` (n,) are the messages of which only the
-    forward velocity is measured; None: none. `left_out` (k,) are indices of messages.
+    forward velocity is measured; None: none. `left_out` (k,) are indices of messages. A message
+    belongs to the node nearest to its stamp less `about_late_ns`.
     """
     usable = np.asarray(np.isfinite(twist.velocity).all(axis=1))
     usable[left_out] = False
-    usable &= (twist.stamps_ns >= nodes_ns[0]) & (twist.stamps_ns <= nodes_ns[-1])
+    about = np.asarray(twist.stamps_ns, dtype=np.int64) - about_late_ns
+    usable &= (about >= nodes_ns[0]) & (about <= nodes_ns[-1])
     if not usable.any():
         return None
-    stamps = np.asarray(twist.stamps_ns, dtype=np.int64)[usable]
-    node = nearest_node(nodes_ns, stamps)
-    stamps = stamps - late_ns
+    node = nearest_node(nodes_ns, about[usable])
+    stamps = about[usable] + (about_late_ns - late_ns)
     T_imu_twist = T_twist_imu.inverse()
     R_imu_twist = T_imu_twist.rotation().matrix()
     arm = T_imu_twist.translation()

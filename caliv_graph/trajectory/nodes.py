@@ -11,7 +11,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
 from caliv_graph.trajectory.antennas import NodeDirections, directions_at_nodes
 from caliv_graph.trajectory.imu import DeadReckoning, Inertial
-from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK, SmootherInput
+from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK, TWIST_CLOCK, SmootherInput
 from caliv_graph.trajectory.measurements import (
     NodeOrientations,
     NodePositions,
@@ -100,10 +100,11 @@ def carry_to_nodes(
             data.noise,
             data.T_vehicle_twist.between(data.T_vehicle_imu),
             data.speed_scale,
-            0 if data.wheels is None else imu_late,
+            data.late_ns.get(TWIST_CLOCK, 0) if data.wheels is None else imu_late,
             data.axle_slip,
             forward_alone(data.motion.twist) if data.speed_alone else None,
             data.slipped,
+            data.about_late_ns,
         )
     headings = baselines = None
     if data.headings is not None and "heading" in kinds:

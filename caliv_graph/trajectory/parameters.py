@@ -17,7 +17,7 @@ from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array
 from caliv_graph.trajectory.chain import UNDETERMINED
-from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK, SmootherInput
+from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK, TWIST_CLOCK, SmootherInput
 
 XYZ = ("x", "y", "z")
 
@@ -208,6 +208,10 @@ def _gnss_late(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, late_ns=_later(data, GNSS_CLOCK, d))
 
 
+def _twist_late(data: SmootherInput, d: Array) -> SmootherInput:
+    return replace(data, late_ns=_later(data, TWIST_CLOCK, d))
+
+
 def _imu_late(data: SmootherInput, d: Array) -> SmootherInput:
     late = _later(data, IMU_CLOCK, d)
     # The ends of gaps are nodes, which stay where they are.
@@ -253,6 +257,12 @@ WHEELS_TIME_OFFSET = replace(
     IMU_TIME_OFFSET, name="twist.time_offset", kinds=IMU_TIME_OFFSET.kinds | {"level"}
 )
 """The same of wheels without an IMU, whose odometry stands in for it."""
+
+SPEEDS_DELAY = InputParameter(
+    "twist.delay", ("value",), "s", np.full(1, 1e-3), frozenset({"velocity"}), _twist_late
+)
+"""The same of velocities beside an IMU, which tells it: a parameter of the drive alone.
+A vehicle's bus stamps them tens of milliseconds after the wheels were read."""
 
 HEADING_YAW = InputParameter(
     "heading.yaw_deg", ("value",), "rad", np.full(1, 1e-3), frozenset({"heading"}), _heading_moved

@@ -87,7 +87,7 @@ def _slipped(data: SmootherInput, nodes: IntArray, states: States) -> IntArray:
     wrong = moving & (_squares(off, moving) > float(chdtri(off.shape[1], OUTLIER_P_VALUE)))
     if moving.sum() < FEWEST_SPEEDS or wrong.sum() > MOST_SLIPPED * moving.sum():
         return none
-    stamps = np.asarray(data.motion.twist.stamps_ns)
+    stamps = np.asarray(data.motion.twist.stamps_ns) - data.about_late_ns
     inside = (stamps >= nodes[0]) & (stamps <= nodes[-1])
     of_wrong = np.isin(nearest_node(nodes, stamps), carried.nodes[wrong])
     return np.flatnonzero(inside & of_wrong)

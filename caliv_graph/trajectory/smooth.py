@@ -7,7 +7,9 @@ origin, and without an orientation source its heading is the x axis.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import gtsam
@@ -25,14 +27,14 @@ from caliv_graph.trajectory.correlated_step import (
 )
 from caliv_graph.trajectory.initial import first_states
 from caliv_graph.trajectory.initial_wheels import first_wheel_states
-from caliv_graph.trajectory.inputs import SmootherInput, noise_sources, scaled
+from caliv_graph.trajectory.inputs import TWIST_CLOCK, SmootherInput, noise_sources, scaled
 from caliv_graph.trajectory.late_fixes import smoother_input
 from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.noise import configured_errors
 from caliv_graph.trajectory.outliers import Robust, dropped_warnings, lost_fixes
-from caliv_graph.trajectory.parameters import GYROSCOPE, UncertainParameter
+from caliv_graph.trajectory.parameters import GYROSCOPE, SPEEDS_DELAY, UncertainParameter
 from caliv_graph.trajectory.slipping import slip_warnings, solve_without_slips
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import (
@@ -55,6 +57,10 @@ from caliv_graph.trajectory.variances import estimated_scales
 
 BIAS_SIGMAS = 5.0
 """Of its prior: a larger bias is reported. A sound sensor exceeds it in one of 600,000 drives."""
+
+
+LATE_S = 0.02
+"""A larger delay of the velocities is reported: less is usual of messages of a vehicle's bus."""
 
 
 def smooth_trajectory(
@@ -83,6 +89,7 @@ def smooth_trajectory(
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)
     data, states, parameters = _begun_at(earlier, data, nodes) or _begun(data, nodes)
+    data = replace(data, about_late_ns=data.late_ns.get(TWIST_CLOCK, 0))
     errors = errors_in(data, [*configured_errors(config), *correlated])
     robust, estimate = solve_without_slips(data, nodes, states)
     warnings += [*lines, *robust.warnings]
@@ -119,6 +126,7 @@ def smooth_trajectory(
     warnings += [*dropped_warnings(robust), *slip_warnings(data)]
     warnings += _bias_warnings(data, estimate.states)
     warnings += _gyroscope_warnings(data, last.settled.parameters)
+    warnings += _delay_warnings(data, last.settled)
     return SmoothedTrajectory(
         trajectory=_at_wanted(data, wanted, nodes, estimate.states, last.cov),
         lost_ns=tuple(lost.tolist()),
@@ -303,6 +311,23 @@ def _gyroscope_warnings(data: SmootherInput, parameters: Sequence[UncertainParam
         f"imu.gyroscope_scale_sigma is {100.0 * sigma:.2g} percent: check its unit and range, or "
         "state a larger sigma"
     ]
+
+
+def _delay_warnings(data: SmootherInput, settled: Settled) -> list[str]:
+    """A line if the velocities are stamped late, or early."""
+    at = 0
+    for p in settled.parameters:
+        if p.parameter is SPEEDS_DELAY:
+            assert p.offset is not None
+            late_s, sigma_s = float(p.offset[0]), math.sqrt(float(settled.cov[at, at]))
+            if abs(late_s) > max(LATE_S, BIAS_SIGMAS * sigma_s):
+                early = "late" if late_s > 0.0 else "early"
+                return [
+                    f"{data.name}: the velocities are stamped {1e3 * abs(late_s):.0f} +- "
+                    f"{1e3 * sigma_s:.0f} ms {early} in the clock of the IMU, which is made up for"
+                ]
+        at += p.parameter.size
+    return []
 
 
 def _bias_warnings(data: SmootherInput, states: States) -> list[str]:

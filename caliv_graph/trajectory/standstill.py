@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import Array, BoolArray, TwistSamples
-from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.inputs import TWIST_CLOCK, SmootherInput
 from caliv_graph.trajectory.wheels import STANDING_M_S
 
 YAW_RATE_RAD_S = 0.005
@@ -60,7 +60,8 @@ def standstills(data: SmootherInput) -> tuple[Standstill, ...]:
         return ()
     out, samples = [], data.inertial
     variance = np.diagonal(data.noise.gyro_density)
-    for begin, end in _standing_ns(twist):
+    late_ns = data.late_ns.get(TWIST_CLOCK, 0)
+    for begin, end in _standing_ns(replace(twist, stamps_ns=twist.stamps_ns - late_ns)):
         first, last = np.searchsorted(samples.stamps_ns, [begin, end])
         rates = samples.gyro[first:last]
         if len(rates) < 2 * MIN_SPEEDS:

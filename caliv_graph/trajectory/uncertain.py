@@ -34,6 +34,7 @@ from caliv_graph.trajectory.parameters import (
     SLOPE,
     SPEED_POINT,
     SPEED_SCALE,
+    SPEEDS_DELAY,
     WHEELS_ROTATION,
     UncertainParameter,
     inertial_time_offset,
@@ -140,6 +141,8 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
         out.append(UncertainParameter(speed_scale(data), np.full(1, scale), np.zeros(1)))
     if data.speed_alone:
         out.append(UncertainParameter(SPEED_POINT, np.array(SPEED_POINT_SIGMAS), np.zeros(2)))
+    if delay_s := data.speeds_delay_sigma_s:
+        out.append(UncertainParameter(SPEEDS_DELAY, np.full(1, delay_s), np.zeros(1)))
     heading = data.config.heading
     if data.headings is not None:
         sigma = np.full(1, np.radians(heading.sigma_deg))
@@ -159,8 +162,9 @@ def _clocks(data: SmootherInput) -> list[UncertainParameter]:
     """The time offsets that have a sigma; of the IMU none where those of LiDARs are free."""
     config, sigmas = data.config, []
     if not config.solve.time_offset:
-        inertial = config.imu if data.wheels is None else config.wheels
-        sigmas.append((inertial_time_offset(data), inertial.time_offset_sigma_s))
+        imu = data.wheels is None
+        sigma_s = config.imu.time_offset_sigma_s if imu else config.wheels.delay_sigma_s(imu)
+        sigmas.append((inertial_time_offset(data), sigma_s))
     late = data.found_late_s
     if data.positions is not None and late is None:
         sigmas.append((GNSS_TIME_OFFSET, config.gnss.time_offset_sigma_s))

@@ -43,6 +43,7 @@ from caliv_graph.trajectory.parameters import (
     LEVER_ARM,
     SECOND_ARM,
     SPEED_POINT,
+    SPEEDS_DELAY,
     mount_rotation,
     speed_scale,
 )
@@ -147,6 +148,7 @@ def estimated_scales(
         typed.append(speed_scale(data))
     typed += [GYROSCOPE] if data.gyroscope_scale_sigma is not None else []
     typed += [SPEED_POINT] if data.speed_alone else []
+    typed += [SPEEDS_DELAY] if data.speeds_delay_sigma_s else []
     if data.wheels is not None:
         typed += [LEAN, AXLE_SLIP] if data.wheels.planar else [LEAN]
     typed += [HEADING_YAW] if data.headings is not None else []

@@ -1,0 +1,78 @@
+"""Speeds beside an IMU that are stamped late, as by a vehicle's bus."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
+from caliv_graph.products import Array, MotionData
+from caliv_graph.trajectory.inputs import TWIST_CLOCK
+from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
+from tests.trajectory.motions import stamps
+from tests.trajectory.test_wheels import DRIVE, beside_imu, settings, whitened
+
+
+def late(late_s: float) -> MotionData:
+    motion = beside_imu(1)
+    assert motion.twist is not None
+    later = motion.twist.stamps_ns + round(late_s * NANOSECONDS_PER_SECOND)
+    return replace(motion, twist=replace(motion.twist, stamps_ns=later))
+
+
+def smooth(motion: MotionData, **wheels: object) -> SmoothedTrajectory:
+    wheels = {"time_offset_sigma_s": None, **wheels}  # as by default
+    return smooth_trajectory(motion, settings(**wheels), stamps(DRIVE.duration_s, 5.0, 0.05))
+
+
+@cache
+def smoothed(late_s: float) -> SmoothedTrajectory:
+    return smooth(late(late_s))
+
+
+def delay_s(found: SmoothedTrajectory) -> tuple[float, float]:
+    sigmas = found.sigmas_of("twist.delay")
+    assert sigmas is not None
+    return found.data.late_s(TWIST_CLOCK), float(sigmas[0])
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.12, -0.03])
+def test_the_delay_is_found(late_s: float) -> None:
+    told_s, sigma_s = delay_s(smoothed(late_s))
+    assert sigma_s < 0.01
+    assert told_s == pytest.approx(late_s, abs=4.0 * sigma_s)
+
+
+def positions(found: SmoothedTrajectory) -> Array:
+    return np.array([T.translation() for T in found.trajectory.T_map_vehicle])
+
+
+def test_poses_are_those_of_speeds_in_time() -> None:
+    # Taken as they are stamped, the vehicle would be 0.12 s, a quarter of a metre, elsewhere.
+    off = np.linalg.norm(positions(smoothed(0.12)) - positions(smoothed(0.0)), axis=1)
+    assert off.max() < 0.01
+    nees, *_ = whitened(late(0.12), smoothed(0.12))
+    assert nees.mean() < 9.0
+
+
+def test_their_noise_is_not_enlarged_by_it() -> None:
+    in_time, late_ones = smoothed(0.0).data.scales, smoothed(0.12).data.scales
+    assert late_ones.keys() == in_time.keys()
+    assert late_ones["speed"] == pytest.approx(in_time["speed"], rel=0.05)
+    assert len(smoothed(0.12).data.slipped) == 0
+
+
+def test_a_delay_is_said_from_20_ms_on() -> None:
+    assert any("ms late in the clock of the IMU" in w for w in smoothed(0.12).warnings)
+    assert any("ms early in the clock of the IMU" in w for w in smoothed(-0.03).warnings)
+    assert not any("in the clock of the IMU" in w for w in smoothed(0.0).warnings)
+
+
+def test_stamps_that_are_exact_have_no_delay() -> None:
+    found = smooth(late(0.0), time_offset_sigma_s=0.0)
+    assert found.sigmas_of("twist.delay") is None
+    assert TWIST_CLOCK not in found.data.late_ns

@@ -318,13 +318,13 @@ def _delay_warnings(data: SmootherInput, settled: Settled) -> list[str]:
     at = 0
     for p in settled.parameters:
         if p.parameter is SPEEDS_DELAY:
-            assert p.offset is not None
-            late_s, sigma_s = float(p.offset[0]), math.sqrt(float(settled.cov[at, at]))
+            late_s, sigma_s = data.late_s(TWIST_CLOCK), math.sqrt(float(settled.cov[at, at]))
             if abs(late_s) > max(LATE_S, BIAS_SIGMAS * sigma_s):
-                early = "late" if late_s > 0.0 else "early"
+                when = "late" if late_s > 0.0 else "early"
+                # To some milliseconds: its sigma is without what bumps and springs add to speeds.
                 return [
-                    f"{data.name}: the velocities are stamped {1e3 * abs(late_s):.0f} +- "
-                    f"{1e3 * sigma_s:.0f} ms {early} in the clock of the IMU, which is made up for"
+                    f"{data.name}: the velocities are stamped about {1e3 * abs(late_s):.0f} ms "
+                    f"{when} in the clock of the IMU, which is made up for"
                 ]
         at += p.parameter.size
     return []

@@ -7,7 +7,7 @@ coordinates, beside the yaw bias.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import gtsam
@@ -83,6 +83,16 @@ class UncertainParameter:
     def graph_sigmas(self) -> Array | None:
         """(p,) of its prior in the graph of a calibration."""
         return self.sigmas if self.beside_lidars is None else self.beside_lidars
+
+
+def sigmas_in(parameters: Sequence[UncertainParameter], cov: Array, name: str) -> Array | None:
+    """(p,) 1 sigma of a parameter by its name; None: `cov`, of all, is without it."""
+    variances, first = np.diagonal(cov), 0
+    for p in parameters:
+        if p.parameter.name == name and first + p.parameter.size <= len(variances):
+            return np.asarray(np.sqrt(variances[first : first + p.parameter.size]))
+        first += p.parameter.size
+    return None
 
 
 def _arm_moved(data: SmootherInput, d: Array) -> SmootherInput:

@@ -7,7 +7,6 @@ origin, and without an orientation source its heading is the x axis.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -34,7 +33,12 @@ from caliv_graph.trajectory.mounting import needs_guess, with_guessed_rotation
 from caliv_graph.trajectory.nodes import place_nodes
 from caliv_graph.trajectory.noise import configured_errors
 from caliv_graph.trajectory.outliers import Robust, dropped_warnings, lost_fixes
-from caliv_graph.trajectory.parameters import GYROSCOPE, SPEEDS_DELAY, UncertainParameter
+from caliv_graph.trajectory.parameters import (
+    GYROSCOPE,
+    SPEEDS_DELAY,
+    UncertainParameter,
+    sigmas_in,
+)
 from caliv_graph.trajectory.slipping import slip_warnings, solve_without_slips
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import (
@@ -315,19 +319,15 @@ def _gyroscope_warnings(data: SmootherInput, parameters: Sequence[UncertainParam
 
 def _delay_warnings(data: SmootherInput, settled: Settled) -> list[str]:
     """A line if the velocities are stamped late, or early."""
-    at = 0
-    for p in settled.parameters:
-        if p.parameter is SPEEDS_DELAY:
-            late_s, sigma_s = data.late_s(TWIST_CLOCK), math.sqrt(float(settled.cov[at, at]))
-            if abs(late_s) > max(LATE_S, BIAS_SIGMAS * sigma_s):
-                when = "late" if late_s > 0.0 else "early"
-                # To some milliseconds: its sigma is without what bumps and springs add to speeds.
-                return [
-                    f"{data.name}: the velocities are stamped about {1e3 * abs(late_s):.0f} ms "
-                    f"{when} in the clock of the IMU, which is made up for"
-                ]
-        at += p.parameter.size
-    return []
+    sigmas = sigmas_in(settled.parameters, settled.cov, SPEEDS_DELAY.name)
+    late_s = data.late_s(TWIST_CLOCK)
+    if sigmas is None or abs(late_s) <= max(LATE_S, BIAS_SIGMAS * float(sigmas[0])):
+        return []
+    # To some milliseconds: its sigma is without what bumps and springs add to speeds.
+    return [
+        f"{data.name}: the velocities are stamped about {1e3 * abs(late_s):.0f} ms "
+        f"{'late' if late_s > 0.0 else 'early'} in the clock of the IMU, which is made up for"
+    ]
 
 
 def _bias_warnings(data: SmootherInput, states: States) -> list[str]:

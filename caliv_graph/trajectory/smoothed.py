@@ -27,7 +27,7 @@ from caliv_graph.trajectory.imu import (
 )
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
-from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter
+from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter, sigmas_in
 from caliv_graph.trajectory.solve import LONE_YAW_SIGMA_RAD
 from caliv_graph.trajectory.states import States, poses_of_vehicle, without_bias
 
@@ -310,12 +310,7 @@ class SmoothedTrajectory:
 
     def sigmas_of(self, name: str) -> Array | None:
         """(p,) 1 sigma of an estimated parameter, by the motion data alone and its prior."""
-        variances, first = np.diagonal(self.parameter_cov), 0
-        for p in self.parameters:
-            if p.parameter.name == name and first + p.parameter.size <= len(variances):
-                return np.asarray(np.sqrt(variances[first : first + p.parameter.size]))
-            first += p.parameter.size
-        return None
+        return sigmas_in(self.parameters, self.parameter_cov, name)
 
     def bias_sigmas(self) -> tuple[Array, Array]:
         """1 sigma of the biases at the nodes: (n, 3) m/s^2 and (n, 3) rad/s, imu frame."""

@@ -19,7 +19,7 @@ nothing but LiDARs and fixes tells how late: who drives so is asked for clocks t
 
 
 class WheelsConfig(Section):
-    """The wheels of a vehicle, as a source of its motion; with an IMU their scale alone counts."""
+    """The wheels of a vehicle, as a source of its motion; with an IMU scale and delay count."""
 
     T_vehicle_wheels: PoseConfig = Field(
         PoseConfig(xyz=(0.0, 0.0, 0.0)),

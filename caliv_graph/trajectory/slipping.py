@@ -10,12 +10,18 @@ from scipy.special import chdtri
 from caliv_graph.common.statistics import MAD
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate, velocity_roots
-from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.inputs import TWIST_CLOCK, SmootherInput
 from caliv_graph.trajectory.measurements import NO_VELOCITIES, nearest_node
 from caliv_graph.trajectory.nodes import carry_to_nodes
-from caliv_graph.trajectory.outliers import OUTLIER_P_VALUE, Robust, solve_without_outliers
+from caliv_graph.trajectory.outliers import (
+    LIMIT_STEP,
+    OUTLIER_P_VALUE,
+    Robust,
+    solve_without_outliers,
+)
+from caliv_graph.trajectory.solve import ROUGH_TOLERANCE, solve
 from caliv_graph.trajectory.states import States, without_bias
-from caliv_graph.trajectory.variances import SCALE_BOUNDS
+from caliv_graph.trajectory.uncertain import Settled, settle
 
 MOST_SLIPPED = 0.2
 """Part of the nodes in motion. If the speeds of more lie apart, they have no common noise, and none
@@ -25,10 +31,48 @@ FEWEST_SPEEDS = 20
 """Nodes in motion from which the scatter of their speeds is known."""
 
 STANDING_M_S = 0.1
-"""Slower wheels stand: they do not slip, and their speeds scatter less."""
+"""Slower vehicles stand: their wheels do not slip, and their speeds scatter less."""
 
-SLIP_ROUNDS = 4
-"""Of leaving out: beside a slip, sound speeds seem off until it is gone, and slighter ones show."""
+LEAST_SCATTER_M_S = 0.02
+"""Speeds on a cruise may scatter less than where the vehicle starts and stops: a low pass, the
+steps of a number and the body's springs all add to them where they change."""
+
+STEP_PART = 0.25
+"""The same in steps of the speeds' numbers: they are off by half a step, and may stay so."""
+
+SLIP_ROUNDS = 8
+"""Of leaving out, worst first: a slip by 10 m/s takes six."""
+
+ABOUT_NS = 5_000_000
+"""How far a delay may be from that by which velocities belong to nodes: a tenth of the way to the
+next one."""
+
+
+def without_slips(settled: Settled, nodes: IntArray) -> Settled:
+    """A rough estimate of states and parameters without speeds that all others do not explain.
+
+    Fixes are all in it: those beside a slip seem wrong until it is left out. And velocities belong
+    to nodes by the delay that is found.
+    """
+    if not _may_slip(settled.data):
+        return settled
+    none = np.zeros(0, dtype=np.int64)
+    limit: float | None = None
+    for _ in range(SLIP_ROUNDS):
+        data = settled.data
+        late_ns = data.late_ns.get(TWIST_CLOCK, 0)
+        if abs(late_ns - data.about_late_ns) > ABOUT_NS:
+            data = replace(data, about_late_ns=late_ns)
+        found, limit = _slipped(data, nodes, settled.estimate.states, limit)
+        if data is settled.data and np.array_equal(found, data.slipped):
+            if limit == _final_limit(data):
+                break
+            continue
+        data = replace(data, slipped=found)
+        estimate = solve(data, nodes, settled.estimate.states, none, "huber", ROUGH_TOLERANCE)
+        of = settled.parameters
+        settled = settle(data, nodes, estimate, none, "huber", of, ROUGH_TOLERANCE)
+    return settled
 
 
 def solve_without_slips(
@@ -39,17 +83,20 @@ def solve_without_slips(
     What a speed is off by is compared with the scatter of all, whatever noise is stated.
     """
     robust, estimate = solve_without_outliers(data, nodes, states)
-    if data.wheels is not None or data.config.robust.kernel == "none":
-        return robust, estimate  # without an IMU, speeds are what all others are compared with
+    if not _may_slip(data):
+        return robust, estimate
+    limit: float | None = None
     for _ in range(SLIP_ROUNDS):
-        found = _slipped(robust.data, nodes, estimate.states)
+        found, limit = _slipped(robust.data, nodes, estimate.states, limit)
         if np.array_equal(found, robust.data.slipped):
-            break
-        states, warnings = estimate.states, robust.warnings
+            if limit == _final_limit(data):
+                break
+            continue
+        states = estimate.states
         del estimate  # its graph: 4 MB per minute of drive
-        data = replace(robust.data, slipped=found)
+        # From the fixes as they were: beside a slip they may have seemed noisier.
+        data = replace(data, slipped=found)
         robust, estimate = solve_without_outliers(data, nodes, states)
-        robust = replace(robust, warnings=(*warnings, *robust.warnings))
     return robust, estimate
 
 
@@ -58,45 +105,71 @@ def slip_warnings(data: SmootherInput) -> list[str]:
     twist, count = data.motion.twist, len(data.slipped)
     if twist is None or not count:
         return []
-    at = np.asarray(twist.stamps_ns)[data.slipped] * 1e-9
+    begins_s = (twist.stamps_ns[data.slipped[0]] - twist.stamps_ns[0]) * 1e-9
+    why = ", as of wheels that slip" if data.speed_alone else ""
     return [
         f"{data.name}: {count} of {len(twist.stamps_ns)} speeds disagree with the motion, left "
-        f"out: the first {at[0] - twist.stamps_ns[0] * 1e-9:.1f} s after the first speed, as of "
-        "wheels that slip"
+        f"out: the first {begins_s:.1f} s after the first speed{why}"
     ]
 
 
-def _slipped(data: SmootherInput, nodes: IntArray, states: States) -> IntArray:
-    """Indices of the messages whose speeds an estimate does not explain."""
-    none = NO_VELOCITIES
-    if data.motion.twist is None:
-        return none
-    all_of_them = replace(data, slipped=none)
+def _may_slip(data: SmootherInput) -> bool:
+    """Without an IMU, speeds are what all others are compared with."""
+    robust = data.config.robust.kernel != "none"
+    return robust and data.wheels is None and data.motion.twist is not None
+
+
+def _final_limit(data: SmootherInput) -> float:
+    return float(chdtri(1 if data.speed_alone else 3, OUTLIER_P_VALUE))
+
+
+def _slipped(
+    data: SmootherInput, nodes: IntArray, states: States, limit: float | None
+) -> tuple[IntArray, float]:
+    """Indices of the messages to leave out now, and the limit of squares that they exceed.
+
+    It comes down from round to round, as that of the fixes does (`outliers.py`).
+    """
+    final = _final_limit(data)
+    twist = data.motion.twist
+    assert twist is not None
     dead = without_bias(data.inertial, nodes, states)
+    all_of_them = replace(data, slipped=NO_VELOCITIES)
     carried = carry_to_nodes(all_of_them, nodes, dead, frozenset({"velocity"})).velocities
     if carried is None:
-        return none
+        return NO_VELOCITIES, final
     R = states.R_map_imu[carried.nodes]
     V = states.velocity_map[carried.nodes]
     falling = -data.gravity_m_s2 * np.einsum("nij,nj->ni", carried.delay_s, R[:, 2, :])
     expected = data.speed_scale * (np.einsum("nji,nj->ni", R, V) + falling)
-    off = np.einsum("nij,nj->ni", velocity_roots(data, carried), expected - carried.velocity_imu)
+    roots = velocity_roots(data, carried)
+    off = np.einsum("nij,nj->ni", roots, expected - carried.velocity_imu)
+    per_m_s = np.median(np.linalg.norm(roots, axis=2), axis=0)
     if data.speed_alone:
-        off = off[:, :1]
-    moving = np.linalg.norm(carried.velocity_imu, axis=1) > STANDING_M_S
-    wrong = moving & (_squares(off, moving) > float(chdtri(off.shape[1], OUTLIER_P_VALUE)))
-    if moving.sum() < FEWEST_SPEEDS or wrong.sum() > MOST_SLIPPED * moving.sum():
-        return none
-    stamps = np.asarray(data.motion.twist.stamps_ns) - data.about_late_ns
-    inside = (stamps >= nodes[0]) & (stamps <= nodes[-1])
-    of_wrong = np.isin(nearest_node(nodes, stamps), carried.nodes[wrong])
-    return np.flatnonzero(inside & of_wrong)
-
-
-def _squares(off: Array, moving: Array) -> Array:
-    """(m,) squares of residuals (m, k) in units of what those of `moving` (m,) scatter by."""
-    if not moving.any():
-        return np.zeros(len(off))
+        off, per_m_s = off[:, :1], per_m_s[:1]
+    speeds = [np.linalg.norm(v, axis=1) for v in (expected, carried.velocity_imu)]
+    moving = np.maximum(*speeds) > STANDING_M_S  # wheels that lock read zero
+    if moving.sum() < FEWEST_SPEEDS:
+        return NO_VELOCITIES, final
     middle = np.median(off[moving], axis=0)
     scatter = MAD * np.median(np.abs(off[moving] - middle), axis=0)
-    return np.asarray(np.sum(((off - middle) / np.maximum(scatter, SCALE_BOUNDS[0])) ** 2, axis=1))
+    least_m_s = max(LEAST_SCATTER_M_S, STEP_PART * _step_m_s(twist.velocity[:, 0]))
+    squares = np.sum(((off - middle) / np.maximum(scatter, least_m_s * per_m_s)) ** 2, axis=1)
+    squares = np.where(moving, squares, 0.0)
+    worst = float(squares.max()) if limit is None else limit
+    limit = max(final, worst / LIMIT_STEP)
+    # A large slip bends all that is near: of these the worst first.
+    most = float(np.quantile(squares[moving], 1.0 - MOST_SLIPPED))
+    if limit == final and most > final:
+        return NO_VELOCITIES, final
+    wrong = squares > max(limit, most)
+    stamps = np.asarray(twist.stamps_ns) - data.about_late_ns
+    inside = (stamps >= nodes[0]) & (stamps <= nodes[-1])
+    of_wrong = np.isin(nearest_node(nodes, stamps), carried.nodes[wrong])
+    return np.flatnonzero(inside & of_wrong & np.isfinite(twist.velocity).all(axis=1)), limit
+
+
+def _step_m_s(speeds: Array) -> float:
+    """Smallest step between speeds (n,); 0 for less than three of them."""
+    distinct = np.unique(np.round(speeds[np.isfinite(speeds)], 4))
+    return float(np.diff(distinct).min()) if len(distinct) > 2 else 0.0

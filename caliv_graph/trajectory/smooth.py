@@ -39,7 +39,7 @@ from caliv_graph.trajectory.parameters import (
     UncertainParameter,
     sigmas_in,
 )
-from caliv_graph.trajectory.slipping import slip_warnings, solve_without_slips
+from caliv_graph.trajectory.slipping import slip_warnings, solve_without_slips, without_slips
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.solve import (
     ROUGH_TOLERANCE,
@@ -55,6 +55,7 @@ from caliv_graph.trajectory.uncertain import (
     moved,
     settle,
     uncertain_parameters,
+    with_exact_speeds,
     with_late_clock,
 )
 from caliv_graph.trajectory.variances import estimated_scales
@@ -93,7 +94,6 @@ def smooth_trajectory(
     wanted, lost, lines = _within_span(data, stamps_ns)
     nodes = place_nodes(data.inertial, wanted)
     data, states, parameters = _begun_at(earlier, data, nodes) or _begun(data, nodes)
-    data = replace(data, about_late_ns=data.late_ns.get(TWIST_CLOCK, 0))
     errors = errors_in(data, [*configured_errors(config), *correlated])
     robust, estimate = solve_without_slips(data, nodes, states)
     warnings += [*lines, *robust.warnings]
@@ -183,6 +183,8 @@ def _begun_at(
     offsets = [np.asarray(p.offset) for p in found]
     if offsets:
         data, _ = moved(data, fresh, np.concatenate(offsets))
+    about_ns, slipped = earlier.data.about_late_ns, earlier.data.slipped
+    data = replace(data, about_late_ns=about_ns, slipped=slipped)
     return data, earlier.states_at(nodes), found
 
 
@@ -197,6 +199,10 @@ def _settled(
     if not parameters:
         return robust, Settled(data, begun.pop())
     settled = settle(data, nodes, begun.pop(), robust.dropped, kernel, parameters)
+    if exact := with_exact_speeds(settled):
+        data, parameters = exact
+        robust, estimate = solve_without_slips(data, nodes, settled.estimate.states)
+        settled = settle(robust.data, nodes, estimate, robust.dropped, kernel, parameters)
     if late := with_late_clock(settled):
         settled = settle(settled.data, nodes, settled.estimate, robust.dropped, kernel, late)
         # Fixes that the wrong time had put beside the path.
@@ -297,6 +303,7 @@ def _roughly_settled(
     # Its graph is not kept beside those of the solves that follow.
     begun = [solve(data, nodes, states, none, "huber", ROUGH_TOLERANCE)]
     settled = settle(data, nodes, begun.pop(), none, "huber", parameters, ROUGH_TOLERANCE)
+    settled = without_slips(settled, nodes)
     return settled.data, settled.estimate.states, settled.parameters
 
 

@@ -6,6 +6,7 @@ linear graph (`README.md`, section 13). After a step the input is moved and the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -19,7 +20,7 @@ from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate, from_values
 from caliv_graph.trajectory.chain import UNDETERMINED, inverse_of
 from caliv_graph.trajectory.columns import parameter_columns
-from caliv_graph.trajectory.inputs import SmootherInput
+from caliv_graph.trajectory.inputs import TWIST_CLOCK, SmootherInput
 from caliv_graph.trajectory.marginals import node_ordering
 from caliv_graph.trajectory.parameters import (
     AXLE_SLIP,
@@ -39,6 +40,7 @@ from caliv_graph.trajectory.parameters import (
     UncertainParameter,
     inertial_time_offset,
     mount_rotation,
+    sigmas_in,
     speed_scale,
 )
 from caliv_graph.trajectory.solve import ERROR_TOLERANCE, solve
@@ -78,6 +80,10 @@ LATE_SIGMAS = 4.0
 """Of what the motion data alone say of that clock, from which it is late: one sound drive in 16,000
 is that far off."""
 
+ALIKE_SIGMAS, ALIKE_S = 3.0, 0.002
+"""Fixes and speeds are late by the same if both are within these sigmas of each other, and beyond
+them from none; the least sigma of their difference, seconds."""
+
 MOST_LATE_SIGMAS = 5.0
 """Largest lateness of the fixes, in sigmas of their clock, at which that is freed."""
 
@@ -86,10 +92,11 @@ WIDE_SIGMAS = {
     IMU_ROTATION.name: np.radians(1.0),
     WHEELS_ROTATION.name: np.radians(1.0),
     SPEED_SCALE.name: 0.01,
+    SPEEDS_DELAY.name: 0.02,
 }
 """From these prior sigmas on (m, rad, part) an error would make sound fixes look like outliers:
-three times the noise of a good fix, what 1 degree is at 3 m, and 2 cm/s at 2 m/s. The parameter is
-then estimated before fixes are rejected."""
+three times the noise of a good fix, what 1 degree is at 3 m, 2 cm/s at 2 m/s and at 1 m/s^2. The
+parameter is then estimated before fixes and speeds are rejected."""
 
 
 @dataclass(frozen=True)
@@ -271,8 +278,52 @@ def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
     None: they do not. A trajectory under a clock that is off by 50 ms is bent by as much as LiDARs
     see of it.
     """
-    at, out = 0, list(settled.parameters)
-    for i, p in enumerate(out):
+    found = _late_fixes(settled)
+    if found is None:
+        return None
+    i, late_s, sigma_s = found
+    p = settled.parameters[i]
+    assert p.beside_lidars is not None
+    # So late is no clock that is merely not synchronised: an antenna a metre from where it was
+    # typed to be swings in curves like one. The ranking of suspects tells which it is.
+    if abs(late_s) <= LATE_SIGMAS * sigma_s or abs(late_s) > MOST_LATE_SIGMAS * p.beside_lidars[0]:
+        return None
+    out = list(settled.parameters)
+    out[i] = replace(p, sigmas=p.beside_lidars)
+    return tuple(out)
+
+
+def with_exact_speeds(
+    settled: Settled,
+) -> tuple[SmootherInput, tuple[UncertainParameter, ...]] | None:
+    """Input and parameters, the speeds in time where they and the fixes seem late by the same.
+
+    None: they do not. It is the IMU that is late then, whatever its prior says: moved to its
+    clock, both would put the vehicle as far along its path.
+    """
+    found, sigmas = (
+        _late_fixes(settled),
+        sigmas_in(settled.parameters, settled.cov, SPEEDS_DELAY.name),
+    )
+    if found is None or sigmas is None:
+        return None
+    _, fixes_s, sigma_s = found
+    speeds_s = settled.data.late_s(TWIST_CLOCK)
+    sigma_s = max(math.hypot(sigma_s, float(sigmas[0])), ALIKE_S)
+    apart, both = abs(fixes_s - speeds_s), min(abs(fixes_s), abs(speeds_s))
+    if not apart < ALIKE_SIGMAS * sigma_s < both:
+        return None
+    late_ns = {clock: ns for clock, ns in settled.data.late_ns.items() if clock != TWIST_CLOCK}
+    data = replace(settled.data, late_ns=late_ns, about_late_ns=0)
+    exact = UncertainParameter(SPEEDS_DELAY, np.full(1, SYNCHRONISED_S), np.zeros(1))
+    out = [exact if p.parameter is SPEEDS_DELAY else p for p in settled.parameters]
+    return data, tuple(out)
+
+
+def _late_fixes(settled: Settled) -> tuple[int, float, float] | None:
+    """Which parameter a held clock of the fixes is, how late the data alone say it is, 1 sigma."""
+    at = 0
+    for i, p in enumerate(settled.parameters):
         if p.parameter is GNSS_TIME_OFFSET:
             if p.beside_lidars is None:  # it is free
                 return None
@@ -280,16 +331,11 @@ def with_late_clock(settled: Settled) -> tuple[UncertainParameter, ...] | None:
             assert p.offset is not None
             variance = settled.cov[at, at]
             told = 1.0 / variance - p.sigmas[0] ** -2.0
+            if told <= 0.0:
+                return None
             # The offset is what the data alone say, times their part of all information.
-            pull = (p.offset[0] + settled.step[at]) / variance
-            if not pull**2 > LATE_SIGMAS**2 * told > 0.0:
-                return None
-            # So late is no clock that is merely not synchronised: an antenna a metre from where it
-            # was typed to be swings in curves like one. The ranking of suspects tells which it is.
-            if abs(pull) > MOST_LATE_SIGMAS * p.beside_lidars[0] * told:
-                return None
-            out[i] = replace(p, sigmas=p.beside_lidars)
-            return tuple(out)
+            late_s = (p.offset[0] + settled.step[at]) / variance / told
+            return i, float(late_s), float(told**-0.5)
         at += p.parameter.size
     return None
 

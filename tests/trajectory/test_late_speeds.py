@@ -14,7 +14,7 @@ from caliv_graph.trajectory.inputs import TWIST_CLOCK
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.motions import stamps
-from tests.trajectory.test_wheels import DRIVE, beside_imu, settings, whitened
+from tests.trajectory.test_wheels import DRIVE, SCALE, beside_imu, settings, whitened
 
 
 def late(late_s: float) -> MotionData:
@@ -64,6 +64,47 @@ def test_their_noise_is_not_enlarged_by_it() -> None:
     assert late_ones.keys() == in_time.keys()
     assert late_ones["speed"] == pytest.approx(in_time["speed"], rel=0.05)
     assert len(smoothed(0.12).data.slipped) == 0
+
+
+def test_a_delay_is_found_where_the_scale_is_exact() -> None:
+    # Lateral velocities are measured, too: nothing but the delay is estimated roughly first.
+    motion = late(0.3)
+    assert motion.twist is not None
+    velocity = motion.twist.velocity.copy()
+    velocity[:, 0] /= SCALE
+    velocity[:, 1:] = 0.03 * np.random.default_rng(4).standard_normal((len(velocity), 2))
+    found = smooth(replace(motion, twist=replace(motion.twist, velocity=velocity)))
+    told_s, sigma_s = delay_s(found)
+    assert sigma_s < 0.01
+    assert told_s == pytest.approx(0.3, abs=4.0 * sigma_s)
+    assert len(found.data.slipped) == 0
+
+
+def test_late_speeds_belong_to_the_nodes_where_they_were_measured() -> None:
+    # Else the IMU carries them over the delay, and its errors turn its own mount.
+    assert smoothed(0.12).data.about_late_ns == pytest.approx(0.12e9, abs=10e6)
+    assert abs(smoothed(0.0).data.about_late_ns) < 10e6
+
+
+def test_an_imu_that_is_late_moves_no_other_clock() -> None:
+    # Fixes and speeds agree with each other, and not with it.
+    motion = beside_imu(1)
+    assert motion.imu is not None
+    imu = replace(motion.imu, stamps_ns=motion.imu.stamps_ns + 20_000_000, orientation_xyzw=None)
+    config = settings(time_offset_sigma_s=None)
+    clocks = {"gnss": 0.02, "imu": 0.005}
+    config = config.model_copy(
+        update={
+            name: getattr(config, name).model_copy(update={"time_offset_sigma_s": sigma_s})
+            for name, sigma_s in clocks.items()
+        }
+    )
+    motion = replace(motion, imu=imu)
+    found = smooth_trajectory(motion, config, stamps(DRIVE.duration_s, 5.0, 0.05))
+    assert abs(found.data.late_s(TWIST_CLOCK)) < 1e-3
+    assert abs(found.data.late_s("gnss")) < 1e-3
+    nees, *_ = whitened(motion, found)
+    assert nees.mean() < 9.0
 
 
 def test_a_delay_is_said_from_20_ms_on() -> None:

@@ -51,7 +51,8 @@ class WheelsConfig(Section):
     time_offset_sigma_s: NonNegative | None = Field(
         None,
         description="seconds, sigma of the stamps of the speeds less the true times; absent: 0.05 "
-        "beside an IMU, 0.01 without one; 0: exact",
+        "beside an IMU (exact where lateral velocities are measured, too), 0.01 without one; "
+        "0: exact",
     )
 
     def rotation_sigmas_rad(self) -> tuple[float, float, float]:
@@ -60,11 +61,16 @@ class WheelsConfig(Section):
         x, y, z = deg if isinstance(deg, tuple) else (deg,) * 3
         return math.radians(x), math.radians(y), math.radians(z)
 
-    def delay_sigma_s(self, beside_imu: bool) -> float:
-        """Sigma of the stamps of the speeds less the true times, seconds; 0: they are exact."""
-        if self.time_offset_sigma_s is None:
-            return DELAY_SIGMA_BESIDE_IMU_S if beside_imu else DELAY_SIGMA_S
-        return self.time_offset_sigma_s
+    def delay_sigma_s(self, of_wheels: bool, beside_imu: bool) -> float:
+        """Sigma of the stamps of the speeds less the true times, seconds; 0: they are exact.
+
+        As is their scale, where lateral velocities are measured, too: by one device, with an IMU.
+        """
+        if self.time_offset_sigma_s is not None:
+            return self.time_offset_sigma_s
+        if beside_imu:
+            return DELAY_SIGMA_BESIDE_IMU_S if of_wheels else 0.0
+        return DELAY_SIGMA_S
 
     def scale_sigma(self, of_wheels: bool) -> float | None:
         """Sigma of the scale of the speeds; None: it is exact."""

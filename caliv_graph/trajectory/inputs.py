@@ -163,8 +163,9 @@ class SmootherInput:
     @property
     def speeds_delay_sigma_s(self) -> float:
         """Of the stamps of velocities beside an IMU; 0: they are exact, or there are none."""
-        beside = self.wheels is None and self.motion.twist is not None
-        return self.config.wheels.delay_sigma_s(beside) if beside else 0.0
+        if self.wheels is not None or self.motion.twist is None:
+            return 0.0
+        return self.config.wheels.delay_sigma_s(self.speed_alone, beside_imu=True)
 
     @property
     def gyroscope_scale_sigma(self) -> float | None:

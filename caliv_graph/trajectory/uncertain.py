@@ -169,8 +169,9 @@ def _clocks(data: SmootherInput) -> list[UncertainParameter]:
     """The time offsets that have a sigma; of the IMU none where those of LiDARs are free."""
     config, sigmas = data.config, []
     if not config.solve.time_offset:
-        imu = data.wheels is None
-        sigma_s = config.imu.time_offset_sigma_s if imu else config.wheels.delay_sigma_s(imu)
+        sigma_s = config.imu.time_offset_sigma_s
+        if data.wheels is not None:
+            sigma_s = config.wheels.delay_sigma_s(of_wheels=True, beside_imu=False)
         sigmas.append((inertial_time_offset(data), sigma_s))
     late = data.found_late_s
     if data.positions is not None and late is None:

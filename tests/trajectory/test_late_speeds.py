@@ -67,17 +67,20 @@ def test_their_noise_is_not_enlarged_by_it() -> None:
 
 
 def test_a_delay_is_found_where_the_scale_is_exact() -> None:
-    # Lateral velocities are measured, too: nothing but the delay is estimated roughly first.
+    # Lateral velocities are measured, too: nothing but the delay is estimated roughly first. By
+    # default that would be exact as well.
     motion = late(0.3)
     assert motion.twist is not None
     velocity = motion.twist.velocity.copy()
     velocity[:, 0] /= SCALE
     velocity[:, 1:] = 0.03 * np.random.default_rng(4).standard_normal((len(velocity), 2))
-    found = smooth(replace(motion, twist=replace(motion.twist, velocity=velocity)))
+    motion = replace(motion, twist=replace(motion.twist, velocity=velocity))
+    found = smooth(motion, time_offset_sigma_s=0.05)
     told_s, sigma_s = delay_s(found)
     assert sigma_s < 0.01
     assert told_s == pytest.approx(0.3, abs=4.0 * sigma_s)
     assert len(found.data.slipped) == 0
+    assert smooth(motion).sigmas_of("twist.delay") is None
 
 
 def test_late_speeds_belong_to_the_nodes_where_they_were_measured() -> None:

@@ -33,9 +33,9 @@ FEWEST_SPEEDS = 20
 STANDING_M_S = 0.1
 """Slower vehicles stand: their wheels do not slip, and their speeds scatter less."""
 
-LEAST_SCATTER_M_S = 0.02
-"""Speeds on a cruise may scatter less than where the vehicle starts and stops: a low pass, the
-steps of a number and the body's springs all add to them where they change."""
+LEAST_SCATTER_M_S = 0.005
+"""Speeds without noise scatter by less than what a node neglects (`README.md`, section 3). With 20
+mm/s, speeds that a ramp puts 90 mm/s off pass for noise of all."""
 
 STEP_PART = 0.25
 """The same in steps of the speeds' numbers: they are off by half a step, and may stay so."""

@@ -189,9 +189,14 @@ def _outliers(squares: Array, config: Config, limit: float | None) -> tuple[IntA
     if config.robust.kernel == "trimmed":
         count = int(len(squares) * config.robust.trim_percent / 100.0)
         return np.sort(np.argsort(squares)[len(squares) - count :]), final
-    worst = float(squares.max(initial=0.0)) if limit is None else limit
-    limit = max(final, worst / LIMIT_STEP)
+    limit = next_limit(squares, limit, final)
     return np.flatnonzero(squares > limit), limit
+
+
+def next_limit(squares: Array, limit: float | None, final: float) -> float:
+    """The limit of a round, after that of the round before; None: it is the first."""
+    worst = float(squares.max(initial=0.0)) if limit is None else limit
+    return max(final, worst / LIMIT_STEP)
 
 
 def _squared_residuals(data: SmootherInput, nodes: IntArray, states: States) -> Array:

@@ -10,13 +10,14 @@ from scipy.special import chdtri
 from caliv_graph.common.statistics import MAD
 from caliv_graph.products import Array, IntArray
 from caliv_graph.trajectory.build import Estimate, velocity_roots
+from caliv_graph.trajectory.factors import velocity_residuals
 from caliv_graph.trajectory.inputs import TWIST_CLOCK, SmootherInput
 from caliv_graph.trajectory.measurements import NO_VELOCITIES, nearest_node
 from caliv_graph.trajectory.nodes import carry_to_nodes
 from caliv_graph.trajectory.outliers import (
-    LIMIT_STEP,
     OUTLIER_P_VALUE,
     Robust,
+    next_limit,
     solve_without_outliers,
 )
 from caliv_graph.trajectory.solve import ROUGH_TOLERANCE, solve
@@ -138,16 +139,14 @@ def _slipped(
     carried = carry_to_nodes(all_of_them, nodes, dead, frozenset({"velocity"})).velocities
     if carried is None:
         return NO_VELOCITIES, final
-    R = states.R_map_imu[carried.nodes]
-    V = states.velocity_map[carried.nodes]
-    falling = -data.gravity_m_s2 * np.einsum("nij,nj->ni", carried.delay_s, R[:, 2, :])
-    expected = data.speed_scale * (np.einsum("nji,nj->ni", R, V) + falling)
+    measured, of = carried.velocity_imu, (carried.delay_s, data.gravity_m_s2, data.speed_scale)
+    residuals = velocity_residuals(states, carried.nodes, measured, *of)
     roots = velocity_roots(data, carried)
-    off = np.einsum("nij,nj->ni", roots, expected - carried.velocity_imu)
+    off = np.einsum("nij,nj->ni", roots, residuals)
     per_m_s = np.median(np.linalg.norm(roots, axis=2), axis=0)
     if data.speed_alone:
         off, per_m_s = off[:, :1], per_m_s[:1]
-    speeds = [np.linalg.norm(v, axis=1) for v in (expected, carried.velocity_imu)]
+    speeds = [np.linalg.norm(v, axis=1) for v in (measured + residuals, measured)]
     moving = np.maximum(*speeds) > STANDING_M_S  # wheels that lock read zero
     if moving.sum() < FEWEST_SPEEDS:
         return NO_VELOCITIES, final
@@ -156,8 +155,7 @@ def _slipped(
     least_m_s = max(LEAST_SCATTER_M_S, STEP_PART * _step_m_s(twist.velocity[:, 0]))
     squares = np.sum(((off - middle) / np.maximum(scatter, least_m_s * per_m_s)) ** 2, axis=1)
     squares = np.where(moving, squares, 0.0)
-    worst = float(squares.max()) if limit is None else limit
-    limit = max(final, worst / LIMIT_STEP)
+    limit = next_limit(squares, limit, final)
     # A large slip bends all that is near: of these the worst first.
     most = float(np.quantile(squares[moving], 1.0 - MOST_SLIPPED))
     if limit == final and most > final:

@@ -36,6 +36,7 @@ from caliv_graph.config.load import load_config
 from caliv_graph.config.model import Config
 from caliv_graph.errors import CalivError
 from caliv_graph.products import Array, BoolArray, IntArray, MotionData
+from caliv_graph.readers.even_stamps import even_stamps
 from caliv_graph.trajectory.correlated import CorrelatedError
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
@@ -48,7 +49,7 @@ from scripts._foreign_vehicle import Motion
 
 SLOW = CorrelatedError(kind="gnss", sigmas=(0.025, 0.025, 0.025), time_s=24.0)
 
-SLIP_S, JUMP_S, FILTER_S = 1.5, 4.0, 0.2
+SLIP_S, JUMP_S, FILTER_S, BURST = 1.5, 4.0, 0.2, 20
 
 Fault = Callable[[MotionData], MotionData]
 
@@ -103,6 +104,22 @@ def _late(seconds: float) -> Fault:
     return fault
 
 
+def _in_bursts(mended: bool) -> Fault:
+    """Samples of the IMU stamped as they arrive, `BURST` at a time; `mended` as a bag is read."""
+
+    def fault(motion: MotionData) -> MotionData:
+        assert motion.imu is not None
+        taken_ns = motion.imu.stamps_ns
+        n = len(taken_ns)
+        last = np.minimum((np.arange(n) // BURST + 1) * BURST, n) - 1
+        arrived_ns = taken_ns[last] + 20_000 * (np.arange(n) % BURST)
+        even = even_stamps(arrived_ns) if mended else None
+        stamps_ns = arrived_ns if even is None else even.stamps_ns
+        return replace(motion, imu=replace(motion.imu, stamps_ns=stamps_ns))
+
+    return fault
+
+
 def _jump(motion: MotionData) -> MotionData:
     assert motion.gnss is not None
     latitude = np.array(motion.gnss.latitude_deg, float)
@@ -121,10 +138,13 @@ FAULTS: Mapping[str, Fault] = {
     "coarse": _everywhere(lambda _, speed: 0.1 * np.round(10.0 * speed)),
     "filtered": _everywhere(_filtered),
     "fixes_jump": _jump,
+    "bursts": _in_bursts(mended=True),
+    "bursts_raw": _in_bursts(mended=False),
 }
 """Name -> what is made of the motion data: wheels that spin by 0.5 m/s or half lock for 1.5 s;
 speeds that are stamped late, read zero below 0.4 m/s, have steps of 0.1 m/s, or went through a low
-pass of 0.2 s; fixes that are 0.3 m beside for 4 s."""
+pass of 0.2 s; fixes that are 0.3 m beside for 4 s; an IMU whose messages are stamped as they
+arrive, 20 at once, with stamps as a bag is read and as they came."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -120,7 +120,10 @@ def read_index(
         topic: (np.array(header_ns, np.int64), np.array(read.records_ns[topic], np.int64))
         for topic, header_ns in read.header_ns.items()
     }
-    clocks = {topic: read_clock(*both) for topic, both in stamps.items()}
+    evenly = {
+        topic for (_, topic), taking in collectors.items() if isinstance(taking, ImuCollector)
+    }
+    clocks = {topic: read_clock(*both, topic in evenly) for topic, both in stamps.items()}
     return BagIndex(
         clocks=clocks,
         frame_ids=read.frame_ids,

@@ -9,6 +9,7 @@ import numpy as np
 
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import IntArray
+from caliv_graph.readers.even_stamps import even_stamps
 
 _FAR_S = 1.0
 """Seconds between header stamps and record times, from which there is a warning: in a drive of one
@@ -65,13 +66,15 @@ def effective_stamps(header_ns: IntArray, record_ns: IntArray) -> IntArray:
     return np.where(header_ns == 0, record_ns, header_ns)
 
 
-def read_clock(header_ns: IntArray, record_ns: IntArray) -> Clock:
+def read_clock(header_ns: IntArray, record_ns: IntArray, evenly: bool = False) -> Clock:
     """Summarises the stamps (n,) of a topic, in the order of the recording.
 
-    A header stamp is 0 where it is not set.
+    A header stamp is 0 where it is not set. Of a sensor that samples `evenly` those of the arrival
+    are replaced (`even_stamps`).
     """
     stamps_ns = effective_stamps(header_ns, record_ns)
-    distinct = np.unique(stamps_ns)
+    even = even_stamps(np.sort(stamps_ns)) if evenly else None
+    distinct = np.unique(stamps_ns) if even is None else even.stamps_ns
     steps = np.diff(distinct)
     usual = float(np.median(steps)) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > _GAP_FACTOR * usual)

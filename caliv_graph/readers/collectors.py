@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from caliv_graph.products import Array, BoolArray, IntArray
+from caliv_graph.readers.even_stamps import even_stamps, said_of
 
 NORM_TOLERANCE = 1e-2
 """Of a quaternion: single precision is off by less."""
@@ -57,11 +58,31 @@ class Rows:
 
     def ordered(self) -> tuple[IntArray, Array, IntArray]:
         """Stamps (n,) strictly increasing, of equal ones the first; their rows; their indices."""
-        # Views for a moment: the results are copies.
-        stamps = np.frombuffer(self._stamps, dtype=np.int64)
-        values = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)
-        stamps, first = np.unique(stamps, return_index=True)
+        recorded, values = self._views()
+        stamps, first = np.unique(recorded, return_index=True)
         return stamps, values[first], first
+
+    def arrivals(self) -> tuple[IntArray, IntArray]:
+        """Stamps (n,) ascending, equal ones in the order of arrival, and their indices.
+
+        Of messages that were sent again with the same stamp and values, the first.
+        """
+        recorded, values = self._views()
+        order = np.argsort(recorded, kind="stable")
+        stamps = recorded[order]
+        equal = np.flatnonzero(stamps[1:] == stamps[:-1])
+        again = (values[order[equal]] == values[order[equal + 1]]).all(axis=1)
+        sent_again = equal[again] + 1
+        return np.delete(stamps, sent_again), np.delete(order, sent_again)
+
+    def at(self, index: IntArray) -> Array:
+        """The rows (n, width) of these indices, a copy."""
+        return self._views()[1][index]
+
+    def _views(self) -> tuple[IntArray, Array]:
+        """All stamps and rows as they were added; views, for a moment."""
+        values = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)
+        return np.frombuffer(self._stamps, dtype=np.int64), values
 
 
 class Stated:
@@ -114,6 +135,9 @@ class RowCollector:
 
     _WIDTH: ClassVar[int]
 
+    _EVEN: ClassVar[bool] = False
+    """Whether the sensor samples evenly, so that stamps of the arrival can be mended."""
+
     def __init__(self) -> None:
         self._rows = Rows(self._WIDTH)
         self._losses = Losses()
@@ -121,11 +145,21 @@ class RowCollector:
     def _usable(self, *reasons: Reason) -> tuple[IntArray, Array, IntArray]:
         """Stamps and rows without those to leave out, and which of the added rows they are."""
         self._losses = Losses()
-        stamps, rows, added = self._rows.ordered()
+        stamps, rows, added = self._ordered()
         for why, test in reasons:
             kept = self._losses.keep(test(rows), why)
             stamps, rows, added = stamps[kept], rows[kept], added[kept]
         return stamps, rows, added
+
+    def _ordered(self) -> tuple[IntArray, Array, IntArray]:
+        """As `Rows.ordered`, with the stamps of an even clock where they are those of arrivals."""
+        if self._EVEN:
+            arrivals, added = self._rows.arrivals()
+            even = even_stamps(arrivals)
+            if even is not None:
+                self._losses.say(said_of(even))
+                return even.stamps_ns, self._rows.at(added), added
+        return self._rows.ordered()
 
     def notes(self) -> list[str]:
         """What was left out, one line each."""

@@ -54,6 +54,7 @@ class ImuCollector(RowCollector):
     """`sensor_msgs/Imu`."""
 
     _WIDTH = 10
+    _EVEN = True
 
     def __init__(self) -> None:
         super().__init__()

@@ -59,6 +59,7 @@ class Lidar:
         divergence_rad: half width of a beam.
         max_range_m: of a return.
         time_field: name of the field of the point's time, which gives its type.
+        deskewed: points are moved to the start of the sweep, and keep their times.
     """
 
     xyz_m: tuple[float, float, float]
@@ -74,6 +75,7 @@ class Lidar:
     divergence_rad: float = 0.0012
     max_range_m: float = 90.0
     time_field: TimeField = "t"
+    deskewed: bool = False
 
     @property
     def period_s(self) -> float:
@@ -251,6 +253,12 @@ class _Moving:
             self._origin += velocity[inverse] * (time_s - at[inverse])[:, None]
         self._time_s = start_s + time_s
 
+    def at_start(self, points: Array) -> Array:
+        """Points (n, 3) of all beams, moved to the LiDAR's frame at the first beam."""
+        there = self._origin + np.einsum("nij,nj->ni", self._turn, points)
+        first = int(np.argmin(self._time_s))
+        return np.asarray((there - self._origin[first]) @ self._turn[first])
+
     def rays(self, directions: Array) -> Rays:
         return Rays(
             self._origin,
@@ -295,6 +303,8 @@ def scan(draws: Draws, name: str, lidar: Lidar, motion: Motion, scene: Scene) ->
         if draws.on("quantisation"):
             far = np.round(far / lidar.quantum_m) * lidar.quantum_m
         points = sent.directions() * far[:, None]
+        if lidar.deskewed:
+            points = moving.at_start(points)
         yield Sweep(
             start_s, points[seen], sent.time_s[seen], sent.channel[seen], 100 * strength[seen]
         )

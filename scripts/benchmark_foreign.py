@@ -20,6 +20,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy
@@ -63,6 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=positive, default=1, help="how many (default: 1)")
     parser.add_argument("--first", type=positive, default=1, help="the first seed (default: 1)")
     parser.add_argument("--off", type=effects_of, default=frozenset(), metavar="EFFECT,...")
+    parser.add_argument(
+        "--deskewed",
+        action="store_true",
+        help="points are moved to the stamp, and keep their times",
+    )
     parser.add_argument("--keep", action="store_true", help="keep the bags")
     parser.add_argument("--out", type=Path, default=OUT, help="folder (default: out/foreign)")
     asked = parser.parse_args(arguments)
@@ -70,7 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in asked.scenarios:
         for seed in range(asked.first, asked.first + asked.seeds):
             draws = Draws(name, seed, asked.off)
-            print(text_of(draws, asked.out / f"{name}_{seed}", asked.keep), flush=True)
+            folder = asked.out / f"{name}_{seed}"
+            print(text_of(draws, folder, asked.keep, asked.deskewed), flush=True)
     return 0
 
 
@@ -83,16 +90,21 @@ def effects_of(text: str) -> frozenset[str]:
     return names
 
 
-def text_of(draws: Draws, folder: Path, keep: bool) -> str:
+def text_of(draws: Draws, folder: Path, keep: bool, deskewed: bool = False) -> str:
     """Simulates, calibrates and compares once; what to print."""
     if folder.exists():
         shutil.rmtree(folder)
     drawn = draws.scenario == RANDOM
     scenario = random_scenario(draws.seed) if drawn else SCENARIOS[draws.scenario]
+    if deskewed:
+        lidars = {name: replace(of, deskewed=True) for name, of in scenario.lidars.items()}
+        scenario = replace(scenario, lidars=lidars)
     simulate(scenario, draws, folder)
     title = f"{draws.scenario}, seed {draws.seed}"
     if drawn:
         title += f" ({in_words(scenario)})"
+    if deskewed:
+        title += ", deskewed"
     if draws.off:
         title += f", without {', '.join(sorted(draws.off))}"
     begun = time.monotonic()

@@ -122,6 +122,12 @@ class LidarConfig(Section):
         description="what the header's stamp marks, start or end of the sweep; auto: by the data",
     )
 
+    deskewed: bool | Literal["auto"] = Field(
+        "auto",
+        description="true: the driver has moved the points of a sweep to the stamp; auto: by the "
+        "data",
+    )
+
     @model_validator(mode="after")
     def _ranges_in_order(self) -> LidarConfig:
         if self.min_range >= self.max_range:

@@ -39,6 +39,8 @@ from caliv_graph.products import (
 from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.readers.empty import CountedRecording
 from caliv_graph.readers.pose_pauses import without_pauses
+from caliv_graph.readers.without_times import WithoutTimes
+from caliv_graph.structure.deskewed import motion_left
 from caliv_graph.structure.own_body import without_own_body
 from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.range_noise import with_range_noise
@@ -62,6 +64,7 @@ from caliv_graph.wording.mounting import (
 )
 from caliv_graph.wording.odometry import odometry_sentence
 from caliv_graph.wording.structure import (
+    deskewed_sentence,
     no_target_sentence,
     own_body_sentence,
     rough_ground_sentence,
@@ -86,6 +89,7 @@ class Prepared:
         no_target: why no target was found; None: one was, or none was to be looked for.
         mistakes: of the config, that explain why LiDARs do not see the target, a sentence each.
         misplaced: beside `contradictions`, those of guesses that the search had to replace.
+        deskewed: LiDARs whose clouds were found to be deskewed before they were recorded.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -99,6 +103,7 @@ class Prepared:
     no_target: TargetError | None = None
     mistakes: tuple[str, ...] = ()
     misplaced: tuple[str, ...] = ()
+    deskewed: frozenset[str] = frozenset()
 
     def without_clouds(self, lidars: Collection[str]) -> Prepared:
         """The same without the target's clouds of some LiDARs, and targets of fewer than two."""
@@ -162,6 +167,7 @@ def prepare(
         CalivError: something is wrong with the input; the message says what to do.
     """
     check_clouds(recordings, config)
+    as_given = recordings, config
     recordings = [CountedRecording(with_common_stamps(recording)) for recording in recordings]
     recordings, pauses = _with_poses(recordings, config, motions)
     raw = raw_findings(motions, config)
@@ -170,9 +176,12 @@ def prepare(
         recordings, config, motions, raw, progress, refused
     )
     config, misplaced, observations, no_target, wrong = search
-    patches, of_body = _without_own_body(
-        _patches(recordings, rough, config, progress), rough, config
-    )
+    every_patch = _patches(recordings, rough, config, progress)
+    deskewed, said = _deskewed(every_patch, config)
+    if deskewed:
+        prepared = prepare(*_as_deskewed(*as_given, deskewed), motions, progress, refused)
+        return replace(prepared, warnings=(*prepared.warnings, said), deskewed=deskewed)
+    patches, of_body = _without_own_body(every_patch, rough, config)
     observations = tuple(with_range_noise(o, patches) for o in observations)
     patches = tuple(without_targets(p, observations, rough[p.drive], config) for p in patches)
     kept = kept_stamps(patches, usable(observations))
@@ -312,6 +321,43 @@ def _patches(
     if not _uses(config):
         return ()
     return read_patches(recordings, trajectories, config, progress, keep_level=True)
+
+
+def _deskewed(patches: Sequence[DrivePatches], config: Config) -> tuple[frozenset[str], str]:
+    """LiDARs whose clouds were deskewed before they were recorded, and a warning.
+
+    Those that do not tell are taken as the others, if these agree.
+    """
+    left = {
+        name: of
+        for name, of in motion_left(patches).items()
+        if config.lidars[name].deskewed == "auto"
+    }
+    told = {name: of for name, of in left.items() if of.deskewed}
+    if not told:
+        return frozenset(), ""
+    swept = {name for of in patches if of.swept is not None for name in of.lidars}
+    open_ = [
+        name
+        for name, lidar in config.lidars.items()
+        if name in swept and name not in told and lidar.deskewed == "auto"
+    ]
+    if any(of.measured for of in left.values()):
+        open_ = []
+    figures = {name: (of.share, of.sigma, of.scans) for name, of in told.items()}
+    return frozenset([*told, *open_]), deskewed_sentence(figures, open_)
+
+
+def _as_deskewed(
+    recordings: Sequence[Recording], config: Config, deskewed: frozenset[str]
+) -> tuple[list[Recording], Config]:
+    """Drives without the times of the points of some LiDARs, and the config that says so."""
+    lidars = {
+        name: lidar.model_copy(update={"deskewed": True}) if name in deskewed else lidar
+        for name, lidar in config.lidars.items()
+    }
+    wrapped: list[Recording] = [WithoutTimes(recording, deskewed) for recording in recordings]
+    return wrapped, config.model_copy(update={"lidars": lidars})
 
 
 def _without_own_body(

@@ -41,10 +41,12 @@ from caliv_graph.pipeline.preparation import Prepared, motions_of, prepare
 from caliv_graph.pipeline.standing import with_standing
 from caliv_graph.products import (
     Calibration,
+    LidarScan,
     MotionData,
     Recording,
 )
 from caliv_graph.readers.sampled import SampledRecording
+from caliv_graph.readers.without_times import WithoutTimes
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
@@ -181,6 +183,8 @@ def _calibrated(
     guessed = used if prior is None else starting_from(used, prior, digests, marks)
 
     prepared = prepare(recordings, guessed, motions, progress, refused)
+    if prepared.deskewed:
+        recordings = [WithoutTimes(recording, prepared.deskewed) for recording in sampled]
     if left_out:
         prepared = prepared.without_clouds({count.lidar for count in left_out})
         notes = (*notes, *(left_out_sentence(outliers_text(count)) for count in left_out))
@@ -247,11 +251,19 @@ def _calibrated(
         drives=tuple(Path(recording.name).absolute().name for recording in recordings),
         trajectories=trajectories,
         grounds=prepared.grounds,
-        scene={drive: recording.kept() for drive, recording in enumerate(sampled)},
+        scene={drive: _scene(recording, prepared) for drive, recording in enumerate(sampled)},
     )
     calibration = replace(calibration, warnings=tuple(dict.fromkeys(warnings)))
     run = CalibrationRun(calibration, solution, prepared.observations, record)
     return run, bool(said)
+
+
+def _scene(recording: SampledRecording, prepared: Prepared) -> tuple[LidarScan, ...]:
+    """Scans of a drive for the report, moved as the calibration moves them."""
+    return tuple(
+        replace(scan, point_times_s=None) if scan.lidar in prepared.deskewed else scan
+        for scan in recording.kept()
+    )
 
 
 def _mistakes(

@@ -184,7 +184,7 @@ class CloudFolder:
                 stamp_ns=stamp_ns,
                 points_lidar=cloud.points_lidar,
                 source=str(self._clouds[lidar][stamp_ns]),
-                point_times_s=cloud.times_s,
+                point_times_s=None if self._lidars[lidar].deskewed is True else cloud.times_s,
             )
 
     def motion(self) -> MotionData:

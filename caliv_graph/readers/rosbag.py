@@ -340,7 +340,7 @@ class RosbagRecording:
             stamp_ns=stamp_ns,
             points_lidar=cloud.points_lidar,
             source=f"{self._bag.name}: {source}",
-            point_times_s=cloud.times_s,
+            point_times_s=None if self._lidars[lidar].deskewed is True else cloud.times_s,
         )
 
     def _cloud_warnings(self) -> list[str]:

@@ -30,6 +30,24 @@ def left_out_sentence(contradiction: str) -> str:
     )
 
 
+def deskewed_sentence(told: Mapping[str, tuple[float, float, int]], others: Sequence[str]) -> str:
+    """The warning that clouds are taken as deskewed before they were recorded.
+
+    By LiDAR the share of the motion that is left in them, its sigma, and the scans that tell;
+    `others` are LiDARs that do not tell, and are taken likewise.
+    """
+    of = " and ".join(
+        f"'{name}' ({share:.2f} +- {sigma:.2f} of the motion is left, in {scans} scans)"
+        for name, (share, sigma, scans) in told.items()
+    )
+    too = f", and {' and '.join(map(repr, others))}, which does not tell," if others else ""
+    return (
+        f"the clouds of lidar {of}{too} were deskewed before they were recorded: where the end of "
+        "a sweep meets its beginning, walls fit as they are. The times of points are not used. Set "
+        "lidars.<name>.deskewed: true for other commands, or false if they were not"
+    )
+
+
 def nothing_sentence(what: str, structure: str) -> str:
     """The error where neither target nor structure tells anything; why, of each."""
     return f"{what}. Structure does not replace it: {structure}"

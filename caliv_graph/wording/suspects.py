@@ -230,7 +230,8 @@ _REMEDIES = {
     ),
     "imu.time_offset": (
         "Check the clock of the IMU against those of GNSS and LiDARs, or set "
-        "imu.time_offset_sigma_s to as much"
+        "imu.time_offset_sigma_s to as much. Clouds that were deskewed before they were recorded "
+        "look the same (lidars.<name>.deskewed: true)"
     ),
     "twist.time_offset": (
         "Check the clock of the velocities against those of GNSS and LiDARs, or set "
@@ -260,7 +261,8 @@ _REMEDIES = {
     "gnss.drift": "The GNSS positions drift by this range over the drive: use better ones",
     "lidars.*.time_offset": (
         "Check the clocks of the LiDARs against those of IMU and GNSS or of the poses, or set "
-        "solve.time_offset"
+        "solve.time_offset. Clouds that were deskewed before they were recorded look the same "
+        "(lidars.<name>.deskewed: true)"
     ),
 }
 """What to check or to set, by the name of the input; drifts of one of several drives likewise."""
@@ -269,7 +271,8 @@ _REMEDIES_OF_LIDAR = {
     "time_offset": (
         "Correct the clock of lidar '{lidar}', or set solve.time_offset; if it is off by a sweep, "
         "set lidars.{lidar}.stamp: start or end. Clouds of a whole sweep without a time per point "
-        "look the same, and no offset mends them"
+        "look the same, and no offset mends them; so do clouds that were deskewed before they were "
+        "recorded (lidars.{lidar}.deskewed: true)"
     ),
     "initial": (
         "Check the initial guess of lidar '{lidar}' (metres, degrees, signs, T_vehicle_lidar and "

@@ -58,7 +58,8 @@ def test_a_clock_is_late_or_early_and_has_a_key() -> None:
     text = ranking_sentence([suspect("lidars.rear.time_offset", 9.0, 9.0)])
     assert "the stamps are 0.100 +- 0.010 s late" in text
     assert "if it is off by a sweep, set lidars.rear.stamp: start or end" in text
-    assert text.endswith("without a time per point look the same, and no offset mends them")
+    assert "without a time per point look the same, and no offset mends them" in text
+    assert text.endswith("deskewed before they were recorded (lidars.rear.deskewed: true)")
 
 
 def test_nothing_is_said_below_five_sigma() -> None:

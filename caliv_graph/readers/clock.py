@@ -73,7 +73,7 @@ def read_clock(header_ns: IntArray, record_ns: IntArray, evenly: bool = False) -
     are replaced (`even_stamps`).
     """
     stamps_ns = effective_stamps(header_ns, record_ns)
-    even = even_stamps(np.sort(stamps_ns)) if evenly else None
+    even = even_stamps(stamps_ns) if evenly else None
     distinct = np.unique(stamps_ns) if even is None else even.stamps_ns
     steps = np.diff(distinct)
     usual = float(np.median(steps)) if len(steps) else 0.0

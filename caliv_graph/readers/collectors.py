@@ -63,17 +63,19 @@ class Rows:
         return stamps, values[first], first
 
     def arrivals(self) -> tuple[IntArray, IntArray]:
-        """Stamps (n,) ascending, equal ones in the order of arrival, and their indices.
+        """Stamps (n,) in the order of arrival, and their indices.
 
         Of messages that were sent again with the same stamp and values, the first.
         """
         recorded, values = self._views()
         order = np.argsort(recorded, kind="stable")
-        stamps = recorded[order]
-        equal = np.flatnonzero(stamps[1:] == stamps[:-1])
-        again = (values[order[equal]] == values[order[equal + 1]]).all(axis=1)
-        sent_again = equal[again] + 1
-        return np.delete(stamps, sent_again), np.delete(order, sent_again)
+        equal = np.flatnonzero(np.diff(recorded[order]) == 0)
+        bits = values.view(np.int64)  # NaN equals itself
+        again = (bits[order[equal]] == bits[order[equal + 1]]).all(axis=1)
+        kept = np.ones(len(recorded), dtype=bool)
+        kept[order[equal[again] + 1]] = False
+        index = np.flatnonzero(kept)
+        return recorded[index], index
 
     def at(self, index: IntArray) -> Array:
         """The rows (n, width) of these indices, a copy."""
@@ -154,9 +156,10 @@ class RowCollector:
     def _ordered(self) -> tuple[IntArray, Array, IntArray]:
         """As `Rows.ordered`, with the stamps of an even clock where they are those of arrivals."""
         if self._EVEN:
-            arrivals, added = self._rows.arrivals()
-            even = even_stamps(arrivals)
+            arrived_ns, added = self._rows.arrivals()
+            even = even_stamps(arrived_ns)
             if even is not None:
+                added = added[np.argsort(arrived_ns, kind="stable")]
                 self._losses.say(said_of(even))
                 return even.stamps_ns, self._rows.at(added), added
         return self._rows.ordered()

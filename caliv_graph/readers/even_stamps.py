@@ -17,19 +17,20 @@ from caliv_graph.products import Array, IntArray
 _LEAST = 200
 """Messages, below which nothing is said of their clock."""
 
-_NEAR, _FAR = 0.5, 1.5
-"""Periods: a step between messages that is shorter or longer is not that of an even clock."""
-
-_UNEVEN = 0.1
-"""The part of such steps from which stamps are those of the arrival: lost messages are fewer."""
+_AT_ONCE, _UNEVEN = 0.3, 0.1
+"""Periods below which a step is one within a burst, and the part of such steps from which stamps
+are those of the arrival: an even clock has none, however many messages are lost."""
 
 _LEAST_TICK = 0.08
 """Periods: shorter steps are within bursts. Longer ones that all others are multiples of are the
 true period, and most of the messages are lost."""
 
+_BACKWARDS_S = 0.02
+"""A step back in the order of arrival, beyond which a clock was set."""
+
 _BLOCK_S, _BLOCK_MESSAGES = 2.0, 40
 """Length of the pieces in which the earliest message tells the clock: many bursts, and a clock that
-a computer slews by 5e-4 is straight to half a millisecond."""
+a computer slews by 5e-4 is straight to half a millisecond. Messages of a piece at least."""
 
 _STEADY = 0.5
 """How much the earliest messages of pieces may scatter, of the range of the delays. Where the
@@ -42,8 +43,8 @@ _SHARP = 0.5
 """Part of the lowest tenth of the delays in what is between it and the middle: 0.2 where they are
 uniform, as in bursts, 0.16 exponential, 0.8 normal."""
 
-_LOST = 3
-"""Periods in a row without a message that are a loss."""
+_LOST = 0.6
+"""Periods by which stamps are ahead for good, from which messages are lost."""
 
 _MOST_LATE_S = 0.5
 """Delay of the latest hundredth of the messages, beyond which they are left as they are."""
@@ -64,28 +65,35 @@ class EvenStamps:
     spread_s: float
 
 
-def even_stamps(stamps_ns: IntArray) -> EvenStamps | None:
-    """The clock behind stamps (n,), in the order of arrival, ascending; equal ones are possible.
+def even_stamps(arrived_ns: IntArray) -> EvenStamps | None:
+    """The clock behind stamps (n,), in the order of arrival; equal ones are possible.
 
-    None where they are even already, too few, or not those of an even clock.
+    Those of `EvenStamps` are in the order of the stamps, equal ones as they arrived. None where
+    they are even already, too few, or not those of an even clock.
     """
-    n = len(stamps_ns)
-    if n < _LEAST or stamps_ns[-1] <= stamps_ns[0]:
+    n = len(arrived_ns)
+    if n < _LEAST or np.diff(arrived_ns).min() < -_BACKWARDS_S * NANOSECONDS_PER_SECOND:
         return None
+    stamps_ns = np.sort(arrived_ns)
     seconds = (stamps_ns - stamps_ns[0]) / NANOSECONDS_PER_SECOND
     index = np.arange(n, dtype=np.float64)
+    steps = np.diff(seconds)
+    if not seconds[-1] or _are_sent_twice(steps):
+        return None
     block = max(_BLOCK_MESSAGES, round(_BLOCK_S * n / seconds[-1]))
-    if n < 3 * block:
+    if n < 3 * block or not _are_uneven(steps / (seconds[-1] / (n - 1))):
         return None
-    period_s = _period_s(seconds, index, block)
-    if period_s <= 0.0 or not _are_uneven(np.diff(seconds) / period_s):
-        return None
-    # Messages that were lost make the first period too long.
-    index += _lost(seconds - period_s * index, seconds, period_s, block)
-    period_s = _period_s(seconds, index, block)
+    # Where none are lost a piece is shortest: a fifth of them, and small ones.
+    slopes = _slopes_s(seconds, index, max(block // 5, _BLOCK_MESSAGES))
+    period_s = float(np.quantile(slopes, 0.2))
+    for _ in range(2):
+        if period_s <= 0.0:
+            return None
+        counted = np.arange(n, dtype=np.float64)
+        index = counted + _lost(seconds - period_s * counted, seconds, period_s, block)
+        period_s = float(np.median(_slopes_s(seconds, index, block)))
     at, low = _earliest(seconds - period_s * index, block)
-    ahead = np.interp(index, index[at], low)
-    even = ahead + period_s * index
+    even = np.interp(index, index[at], low) + period_s * index
     delay = seconds - even
     even += _least(delay, stamps_ns, period_s)
     delay = seconds - even
@@ -93,6 +101,7 @@ def even_stamps(stamps_ns: IntArray) -> EvenStamps | None:
     spread_s = float(np.subtract(*np.quantile(delay, (0.9, 0.1))))
     if (
         spread_s < _LEAST_SPREAD * period_s
+        or spread_s > np.quantile(steps, 0.99)  # a burst is no longer than the step before it
         or np.median(bend) > _STEADY * spread_s
         or np.quantile(delay, 0.99) > _MOST_LATE_S
         or not (np.diff(even) > 0.0).all()
@@ -115,9 +124,14 @@ def said_of(even: EvenStamps) -> str:
     )
 
 
+def _are_sent_twice(steps: Array) -> bool:
+    """Whether nearly every stamp is there twice: two publishers, or a relay."""
+    return bool(len(steps) > 2 and np.mean((steps[1:] == 0.0) != (steps[:-1] == 0.0)) > 0.95)
+
+
 def _are_uneven(steps: Array) -> bool:
-    """Whether steps (n,) between stamps, in periods, are those of no clock that skips some."""
-    if np.mean((steps < _NEAR) | (steps > _FAR)) < _UNEVEN:
+    """Whether steps (n,), in periods, are those of arrivals, not of a clock that skips some."""
+    if np.mean(steps < _AT_ONCE) < _UNEVEN:
         return False
     tick = float(np.quantile(steps, 0.05))
     if tick < _LEAST_TICK:
@@ -134,7 +148,7 @@ def _least(delay: Array, stamps_ns: IntArray, period_s: float) -> float:
     """
     least, early, middle = np.quantile(delay, (0.01, 0.1, 0.5))
     step_ns = int(np.diff(np.unique(stamps_ns)).min())
-    rounded = step_ns > 1e9 * _NEAR * period_s and not (stamps_ns % step_ns).any()
+    rounded = step_ns > 0.5e9 * period_s and not (stamps_ns % step_ns).any()
     return float(middle if rounded or early - least > _SHARP * (middle - early) else least)
 
 
@@ -146,25 +160,27 @@ def _earliest(ahead: Array, block: int) -> tuple[IntArray, Array]:
     return at, ahead[at]
 
 
-def _period_s(seconds: Array, index: Array, block: int) -> float:
-    """The median step from the earliest message of one piece to that of the next."""
+def _slopes_s(seconds: Array, index: Array, block: int) -> Array:
+    """Steps from the earliest message of each piece to that of the next (n,), per message."""
     usual_s = float(seconds[-1] / index[-1])
     at, low = _earliest(seconds - usual_s * index, block)
-    return usual_s + float(np.median(np.diff(low) / np.diff(index[at])))
+    return np.asarray(usual_s + np.diff(low) / np.diff(index[at]))
 
 
 def _lost(ahead: Array, seconds: Array, period_s: float, block: int) -> IntArray:
     """Messages lost before each (n,), from how much the stamps are ahead of counted periods.
 
-    Delays come and go; what never comes back is lost: the least of all that follow. Few messages,
-    and the last ones, which nothing follows, are left to the pieces, whose clock bends by as much.
+    Delays come and go; what never comes back is lost: the least of all that follow. The last ones,
+    which nothing follows, are left to the pieces, whose clock bends by as much.
     """
+    _, low = _earliest(ahead, block)
+    noise = float(np.median(np.abs(np.diff(low, 2)))) / period_s
     stays = np.minimum.accumulate(ahead[::-1])[::-1]
-    jumps = np.rint(np.diff(stays) / period_s).astype(np.int64)
+    jumps = np.diff(stays) / period_s
     lost = np.zeros(len(ahead), np.int64)
-    for at in np.flatnonzero(jumps[:-block] >= _LOST).tolist():
+    for at in np.flatnonzero(jumps[:-block] >= max(_LOST, 3.0 * noise)).tolist():
         # Which the burst has lost is not known: they are taken to lie in its longest step.
         first = max(at - _BLOCK_MESSAGES // 2, 0)
         steps = np.diff(seconds[first : at + _BLOCK_MESSAGES // 2])
-        lost[first + int(np.argmax(steps)) + 1] += jumps[at]
+        lost[first + int(np.argmax(steps)) + 1] += round(float(jumps[at]))
     return np.cumsum(lost)

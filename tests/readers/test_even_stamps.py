@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from caliv_graph.products import Array, IntArray
+from caliv_graph.products import Array, BoolArray, IntArray
 from caliv_graph.readers.clock import clock_warnings, read_clock
 from caliv_graph.readers.even_stamps import even_stamps
 from caliv_graph.readers.imu import ImuCollector
@@ -40,9 +40,10 @@ def times(hz: float = HZ, lost: slice | None = None) -> Array:
 
 def in_bursts(taken: Array, of: int) -> Sent:
     """Handed over together when the last of them is there, within half a millisecond."""
-    last = taken[np.minimum((np.arange(len(taken)) // of + 1) * of, len(taken)) - 1]
-    late = np.random.default_rng(1).uniform(0.0, 5e-4, len(taken))
-    return Sent(taken, np.maximum.accumulate(last + np.repeat(late[::of], of)[: len(taken)]))
+    k = np.arange(len(taken))
+    last = taken[np.minimum((k // of + 1) * of, len(taken)) - 1]
+    late = np.random.default_rng(1).uniform(0.0, 4e-4, len(taken))
+    return Sent(taken, last + late[k // of] + 2e-6 * (k % of))
 
 
 def by_latency_timer(taken: Array, period_s: float = 0.016) -> Sent:
@@ -92,6 +93,20 @@ def test_what_was_lost_leaves_a_gap() -> None:
     assert np.abs(sent.errors_ms()).max() < 16.0 + 1e3 / HZ
 
 
+@pytest.mark.parametrize("part", [0.01, 0.1])
+def test_single_messages_are_missed_where_bursts_tell(part: float) -> None:
+    taken = times()
+    sent = in_bursts(taken[np.random.default_rng(6).random(len(taken)) > part], 5)
+
+    even = even_stamps(sent.stamps_ns)
+
+    # Or they are left as they are: what bends more than a burst is no clock.
+    if even is not None:
+        assert np.std(sent.errors_ms()) < 1e3 * np.std(sent.arrived - sent.taken)
+    else:
+        assert part > 0.05
+
+
 def test_a_clock_that_is_slewed_is_followed() -> None:
     taken = times()
     slewed = taken + 5e-4 * np.clip(taken - 8.0, 0.0, 12.0)  # as NTP does
@@ -109,6 +124,15 @@ def test_errors_to_both_sides_are_right_in_the_middle() -> None:
     assert abs(np.mean(Sent(taken, rounded).errors_ms())) < 3.0  # half a period, to which side
 
 
+def jittered(stamps: Array, most_s: float) -> Array:
+    return stamps + np.random.default_rng(5).uniform(0.0, most_s, len(stamps))
+
+
+def throttled(n: int) -> list[BoolArray]:
+    """Which of n messages a topic keeps that drops every third or fourth, or two of four."""
+    return [np.resize(np.array(kept, bool), n) for kept in ((1, 1, 0), (1, 1, 1, 0), (1, 1, 0, 0))]
+
+
 def test_stamps_that_are_even_or_truly_uneven_are_left_alone() -> None:
     rng = np.random.default_rng(4)
     taken = times()
@@ -120,7 +144,10 @@ def test_stamps_that_are_even_or_truly_uneven_are_left_alone() -> None:
         times(lost=slice(2000, 2160)),
         np.delete(taken, rng.choice(len(taken), len(taken) // 40, replace=False)),
         taken[rng.random(len(taken)) > 0.2],
-        taken[rng.random(len(taken)) > 0.7] + rng.uniform(0.0, 0.1 / HZ),
+        taken[rng.random(len(taken)) > 0.7],
+        *(jittered(taken[kept], 0.1 / HZ) for kept in throttled(len(taken))),
+        np.repeat(taken, 2),
+        np.append(in_bursts(taken, 5).arrived, 20.0 + times()),
         np.append(times(100.0), SECONDS + times(200.0)),
         uneven,
         in_bursts(taken, 20).arrived[:150],

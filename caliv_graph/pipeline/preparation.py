@@ -177,11 +177,17 @@ def prepare(
     )
     config, misplaced, observations, no_target, wrong = search
     every_patch = _patches(recordings, rough, config, progress)
-    deskewed, said = _deskewed(every_patch, config)
+    deskewed, said = _deskewed(every_patch, rough, config, motions)
     if deskewed:
+        del every_patch, rough, recordings, search, observations
         prepared = prepare(*_as_deskewed(*as_given, deskewed), motions, progress, refused)
-        return replace(prepared, warnings=(*prepared.warnings, said), deskewed=deskewed)
+        return replace(
+            prepared,
+            warnings=(*prepared.warnings, said),
+            deskewed=prepared.deskewed | deskewed,
+        )
     patches, of_body = _without_own_body(every_patch, rough, config)
+    del every_patch
     observations = tuple(with_range_noise(o, patches) for o in observations)
     patches = tuple(without_targets(p, observations, rough[p.drive], config) for p in patches)
     kept = kept_stamps(patches, usable(observations))
@@ -323,29 +329,38 @@ def _patches(
     return read_patches(recordings, trajectories, config, progress, keep_level=True)
 
 
-def _deskewed(patches: Sequence[DrivePatches], config: Config) -> tuple[frozenset[str], str]:
+def _deskewed(
+    patches: Sequence[DrivePatches],
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    motions: Mapping[int, MotionData],
+) -> tuple[frozenset[str], str]:
     """LiDARs whose clouds were deskewed before they were recorded, and a warning.
 
-    Those that do not tell are taken as the others, if these agree.
+    Those that do not tell are taken as the others, if none of these is as it was measured. None by
+    an odometry of LiDARs, which was made with the times.
     """
-    left = {
-        name: of
-        for name, of in motion_left(patches).items()
-        if config.lidars[name].deskewed == "auto"
-    }
-    told = {name: of for name, of in left.items() if of.deskewed}
+    asked = {name for name, lidar in config.lidars.items() if lidar.deskewed == "auto"}
+    if not asked or any(isinstance(motion.poses, OdometryPoses) for motion in motions.values()):
+        return frozenset(), ""
+    guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
+    left = motion_left(patches, trajectories, guesses)
+    told = {name: of for name, of in left.items() if of.deskewed and name in asked}
     if not told:
         return frozenset(), ""
-    swept = {name for of in patches if of.swept is not None for name in of.lidars}
-    open_ = [
-        name
-        for name, lidar in config.lidars.items()
-        if name in swept and name not in told and lidar.deskewed == "auto"
-    ]
-    if any(of.measured for of in left.values()):
-        open_ = []
+    # A LiDAR without times has none to leave out.
+    swept = {
+        of.lidars[k] for of in patches for k in np.unique(of.scan_lidar[of.scan[of.time_s != 0]])
+    }
+    measured = any(of.measured for of in left.values())
+    measured |= any(lidar.deskewed is False for lidar in config.lidars.values())
+    silent = (
+        []
+        if measured
+        else [name for name in config.lidars if name in (asked & swept) - left.keys()]
+    )
     figures = {name: (of.share, of.sigma, of.scans) for name, of in told.items()}
-    return frozenset([*told, *open_]), deskewed_sentence(figures, open_)
+    return frozenset([*told, *silent]), deskewed_sentence(figures, silent)
 
 
 def _as_deskewed(

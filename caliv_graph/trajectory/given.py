@@ -9,6 +9,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.interpolation import PoseCurve
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, IntArray, MotionData, Trajectory
+from caliv_graph.trajectory.imu import log_so3
 from caliv_graph.trajectory.noise import stated
 
 RARE_S, ROUGH_M = 0.2, 2e-3
@@ -21,6 +22,17 @@ FEWEST_POSES = 8
 HALVING = 10.0
 """Error of the curve midway between poses, over its root mean square between poses half as far
 apart: 8 to 20 on drives with curves of 9 m (chords: 5)."""
+
+
+MOSTLY_SLOW = 2.0
+"""Stated white errors over the scatter of the poses, from which what is stated is no white error.
+The scatter has the jerk of the vehicle in it: it is a bound."""
+
+EVEN_STEPS = 0.2
+"""By how much of a step the next ones may differ where scatter is told."""
+
+FEWEST_STEPS = 50
+"""Of poses that come evenly."""
 
 
 def given_trajectory(motion: MotionData) -> Trajectory:
@@ -38,6 +50,49 @@ def given_trajectory(motion: MotionData) -> Trajectory:
             "Choose another topics.pose or data.poses"
         )
     return Trajectory(poses.stamps_ns, poses.T_map_vehicle, poses.cov)
+
+
+def scatter_of_poses(trajectory: Trajectory) -> tuple[float, float] | None:
+    """White error that given poses have at most: 1 sigma per axis, rotation (rad), position (m).
+
+    By third differences, in which the white errors of four poses have 20 times their variance and a
+    steady acceleration none (`README.md`, section 11). None: too few poses come evenly.
+    """
+    steps = np.diff(trajectory.stamps_ns).astype(np.float64)
+    if len(steps) < FEWEST_STEPS:
+        return None
+    three = np.stack([steps[:-2], steps[1:-1], steps[2:]])
+    even = np.ptp(three, axis=0) < EVEN_STEPS * np.median(steps)
+    even &= three[0] < 2.0 * np.median(steps)
+    if np.count_nonzero(even) < FEWEST_STEPS:
+        return None
+    R, t = stack(trajectory.T_map_vehicle)
+    turns = log_so3(np.swapaxes(R[:-1], 1, 2) @ R[1:])
+    found = []
+    for third in (np.diff(turns, n=2, axis=0)[even], np.diff(t, n=3, axis=0)[even]):
+        spread = 1.4826 * np.median(np.abs(third - np.median(third, axis=0)), axis=0)
+        found.append(float(np.sqrt(np.mean(spread**2) / 20.0)))
+    return found[0], found[1]
+
+
+def slow_errors_stated(
+    trajectory: Trajectory,
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """What poses state (rad, m) and what they scatter by at most, if the first is no white error.
+
+    A localiser states how far it may be off. That error is mostly slow: taken as white it leaves
+    nothing for the slow one, and a hundred poses would know the vehicle ten times as well. None:
+    nothing is stated, or poses scatter as much.
+    """
+    if trajectory.cov is None:
+        return None
+    known, scatter = trajectory.cov[stated(trajectory.cov)], scatter_of_poses(trajectory)
+    if not len(known) or scatter is None:
+        return None
+    variances = np.median(np.diagonal(known, axis1=1, axis2=2), axis=0)
+    said = float(np.sqrt(variances[:3].mean())), float(np.sqrt(variances[3:].mean()))
+    slow = any(of > MOSTLY_SLOW * at_most for of, at_most in zip(said, scatter, strict=True))
+    return (said, scatter) if slow else None
 
 
 def rare_poses(trajectory: Trajectory, stamps_ns: IntArray) -> tuple[float, float] | None:

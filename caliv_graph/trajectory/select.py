@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -16,7 +17,12 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.interpolation import PoseCurve
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
-from caliv_graph.trajectory.given import error_covariances, given_trajectory, rare_poses
+from caliv_graph.trajectory.given import (
+    error_covariances,
+    given_trajectory,
+    rare_poses,
+    slow_errors_stated,
+)
 from caliv_graph.trajectory.noise import stated
 from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.smooth import smooth_trajectory
@@ -192,6 +198,16 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
             f"{motion.name}: {unknown} of {count} vehicle poses state no covariance: their white "
             "error is estimated"
         )
+    slow = slow_errors_stated(trajectory)
+    if slow is not None:
+        (turn, place), (turn_most, place_most) = slow
+        warnings.append(
+            f"{motion.name}: the vehicle's poses state errors of {math.degrees(turn):.2g} degrees "
+            f"and {1e3 * place:.2g} mm, and from one to the next they scatter by at most "
+            f"{math.degrees(turn_most):.2g} degrees and {1e3 * place_most:.2g} mm: what they state "
+            "is mostly a slow error. White and slow errors of the poses are estimated instead"
+        )
+        trajectory = replace(trajectory, cov=None)
     rare = rare_poses(trajectory, stamps)
     if rare is not None:
         step_s, sigma_m = rare

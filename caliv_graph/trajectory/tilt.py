@@ -112,7 +112,8 @@ def body_sigma_rad(config: Config) -> float:
 def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> VehicleTilt:
     """Roll and pitch of the vehicle's axes over a drive.
 
-    Pitch by least squares against the climb of the path, roll by `_across_a_surface`.
+    Pitch by least squares against the climb of the path, if heights were measured, roll by
+    `_across_a_surface`.
     """
     begin, end = trajectory.span_ns
     count = min(MAX_SAMPLES, max(int((end - begin) // STEP_NS), 1))
@@ -126,7 +127,7 @@ def vehicle_tilt(trajectory: VehicleTrajectory, name: str, config: Config) -> Ve
     moved = trajectory.poses_at(after)[1] - trajectory.poses_at(before)[1]
     seconds = (after - before) / NANOSECONDS_PER_SECOND
     across = np.hypot(moved[:, 0], moved[:, 1])
-    driving = across > MIN_SPEED_M_S * seconds
+    driving = (across > MIN_SPEED_M_S * seconds) & _knows_heights(trajectory)
     climb = np.where(driving, moved[:, 2] / np.where(driving, across, 1.0), 0.0)
     # Positive where the vehicle moves forward.
     ahead = np.sign(moved[:, 0] * np.cos(heading) + moved[:, 1] * np.sin(heading))
@@ -240,6 +241,14 @@ def _as_configured(trajectory: VehicleTrajectory) -> Array:
         if each.parameter is IMU_ROTATION and each.offset is not None:
             return np.asarray(exp_so3(each.offset[None])[0])
     return np.eye(3)
+
+
+def _knows_heights(trajectory: VehicleTrajectory) -> bool:
+    """Whether heights were measured, and so the climb of the path.
+
+    Without fixes they are those of the accelerometer, whose bias and mounting look like a climb.
+    """
+    return not isinstance(trajectory, SmoothedTrajectory) or trajectory.data.positions is not None
 
 
 def _attitude_cov(trajectory: VehicleTrajectory) -> Array:

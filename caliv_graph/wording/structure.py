@@ -43,8 +43,9 @@ def deskewed_sentence(told: Mapping[str, tuple[float, float, int]], others: Sequ
     too = f", and {' and '.join(map(repr, others))}, which does not tell," if others else ""
     return (
         f"the clouds of lidar {of}{too} were deskewed before they were recorded: where the end of "
-        "a sweep meets its beginning, walls fit as they are. The times of points are not used. Set "
-        "lidars.<name>.deskewed: true for other commands, or false if they were not"
+        "a sweep meets its beginning, walls fit as they are. The times of points are not used, and "
+        "all points are taken as of the stamp. Set lidars.<name>.deskewed: true for other "
+        "commands, or false if they were not"
     )
 
 

@@ -13,8 +13,9 @@ from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config
 from caliv_graph.config.mounting import PoseConfig
+from caliv_graph.products import Array, BoolArray
 from caliv_graph.structure.deskewed import MotionLeft, motion_left
-from caliv_graph.structure.patches import DrivePatches
+from caliv_graph.structure.patches import DrivePatches, Swept
 from caliv_graph.structure.read import read_patches
 from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import GivenTrajectory
@@ -50,7 +51,7 @@ def spinner(degrees: float = 360.0, sweep_s: float = 0.1) -> Spinner:
 
 def read(world: World, trajectory: GivenTrajectory, lidar: Spinner, moved: bool) -> DrivePatches:
     begin, end = trajectory.span_ns
-    stamps = np.arange(begin + 100_000_000, end - 100_000_000, 1_500_000_000, dtype=np.int64)
+    stamps = np.arange(begin + 100_000_000, end - 100_000_000, 750_000_000, dtype=np.int64)
     recording = recorded(world, trajectory, {"roof": lidar}, {"roof": stamps})
     if moved:
         clouds = tuple(
@@ -62,9 +63,26 @@ def read(world: World, trajectory: GivenTrajectory, lidar: Spinner, moved: bool)
     return patches
 
 
+def told(patches: DrivePatches, trajectory: GivenTrajectory = EIGHT) -> MotionLeft | None:
+    return motion_left([patches], [trajectory], {"roof": GUESS}).get("roof")
+
+
+def near_yard() -> World:
+    """The yard with walls at three quarters of the distance: a sweep ends at them more often."""
+    walls = yard()
+    scale = np.array([0.75, 0.75, 1.0])
+    return World(scale * walls.corner, scale * walls.first, scale * walls.second)
+
+
 @cache
+def in_yard(moved: bool) -> DrivePatches:
+    return read(near_yard(), EIGHT, spinner(), moved)
+
+
 def found(moved: bool) -> MotionLeft:
-    return motion_left([read(yard(), EIGHT, spinner(), moved)])["roof"]
+    left = told(in_yard(moved))
+    assert left is not None
+    return left
 
 
 def test_measured_points_have_all_of_the_motion() -> None:
@@ -93,26 +111,59 @@ def test_deskewed_points_have_none() -> None:
     ids=["ground alone", "at an instant", "no end that meets the beginning"],
 )
 def test_what_is_not_seen_at_two_times_tells_nothing(world: World, lidar: Spinner) -> None:
-    assert motion_left([read(world, EIGHT, lidar, moved=False)]) == {}
+    assert told(read(world, EIGHT, lidar, moved=False)) is None
 
 
-def test_the_vehicle_itself_does_not_look_deskewed() -> None:
-    # A cab of 3 m that the LiDAR sees where its sweep ends and begins, upright across the motion.
-    cab = world_of(
-        [np.array([-2.0, -2.5, 0.5]), np.array([0.0, 3.0, 0.0]), np.array([0.0, 0.0, 3.0])]
+def test_the_vehicle_itself_and_a_car_that_follows_do_not_look_deskewed() -> None:
+    # Upright across the motion, where the sweep ends and begins: a cab of 3 m, a car at 8 m.
+    for behind_m in (2.0, 8.0):
+        plate = world_of(
+            [np.array([-behind_m, -2.5, 0.5]), np.array([0.0, 3.0, 0.0]), np.array([0.0, 0.0, 3.0])]
+        )
+        seen = read(near_yard(), EIGHT, replace(spinner(), body=plate), moved=False)
+        on_plate = np.abs(np.linalg.norm(seen.centres_lidar, axis=1) - behind_m - 1.5) < 1.5
+        assert np.count_nonzero(on_plate) > 100
+        left = told(seen)
+        assert left is None or left.measured
+
+
+def stacked(*parts: tuple[DrivePatches, BoolArray]) -> DrivePatches:
+    """Patches of the same scans from several, in the order of the scans."""
+    order = np.argsort(np.concatenate([of.scan[keep] for of, keep in parts]), kind="stable")
+
+    def together(values: list[Array]) -> Array:
+        return np.asarray(np.concatenate(values)[order])
+
+    swept = [of.swept.part(keep) for of, keep in parts if of.swept is not None]
+    return replace(
+        parts[0][0],
+        scan=np.concatenate([of.scan[keep] for of, keep in parts])[order],
+        time_s=together([of.time_s[keep] for of, keep in parts]),
+        moments=together([of.moments[keep] for of, keep in parts]),
+        normal_lidar=together([of.normal_lidar[keep] for of, keep in parts]),
+        scatter_m=together([of.scatter_m[keep] for of, keep in parts]),
+        swept=Swept(
+            together([of.moments for of in swept]), together([of.twist_lidar for of in swept])
+        ),
+        channels=None,
     )
-    seen = read(yard(), EIGHT, replace(spinner(), body=cab), moved=False)
-    assert np.count_nonzero(np.linalg.norm(seen.centres_lidar, axis=1) < 5.0) > 300
 
-    left = motion_left([seen])
 
-    assert "roof" not in left or left["roof"].measured
+def test_a_few_scans_of_something_else_change_nothing() -> None:
+    measured, moved = in_yard(moved=False), in_yard(moved=True)
+    some = [of.scan % 8 == 0 for of in (measured, moved)]
+    left = told(stacked((measured, ~some[0]), (moved, some[1])))
+    assert left is not None
+    assert left.measured
+    assert left.share == pytest.approx(found(moved=False).share, abs=0.05)
 
 
 def test_a_share_in_between_is_neither() -> None:
     for share in (-0.6, 0.4, 0.5, 0.6, 1.6):
-        left = MotionLeft(share, 0.1, 50)
+        left = MotionLeft(share, 0.1, 50, float(share < 0.5))
         assert not left.deskewed
         assert not left.measured
-    assert not MotionLeft(0.0, 0.3, 50).deskewed
-    assert not MotionLeft(1.0, 0.3, 50).measured
+    assert not MotionLeft(0.0, 0.3, 50, 1.0).deskewed
+    assert MotionLeft(0.0, 0.1, 50, 0.8).deskewed
+    assert not MotionLeft(0.0, 0.1, 50, 0.6).deskewed
+    assert not MotionLeft(1.0, 0.3, 50, 0.0).measured

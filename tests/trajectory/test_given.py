@@ -11,7 +11,7 @@ import pytest
 
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array, GivenPoses, MotionData, Recording, Trajectory
-from caliv_graph.trajectory.given import given_trajectory
+from caliv_graph.trajectory.given import given_trajectory, scatter_of_poses
 from caliv_graph.trajectory.noise import (
     MIN_POSE_POSITION_M,
     MIN_POSE_ROTATION_RAD,
@@ -52,6 +52,62 @@ def test_one_pose_is_no_drive(stamps: tuple[int, ...]) -> None:
 def test_a_drive_without_poses_is_an_error() -> None:
     with pytest.raises(TrajectoryError, match="drive/: has no vehicle poses"):
         given_trajectory(MotionData("drive/"))
+
+
+def localised(
+    white: tuple[float, float], slow: tuple[float, float], said: tuple[float, float]
+) -> MotionData:
+    """A curve of 60 s at 20 Hz, with errors (rad, m) per axis, and what every message states."""
+    rng, n = np.random.default_rng(3), 1200
+    seconds = 0.05 * np.arange(n)
+    yaw = 0.4 * np.sin(0.3 * seconds)
+    way = np.cumsum(0.1 * np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=1), axis=0)
+    wave = np.sin(2.0 * np.pi * (seconds[:, None] / 20.0 + np.arange(6) / 6.0)) * np.sqrt(2.0)
+    error = rng.standard_normal((n, 6)) * np.repeat(white, 3) + wave * np.repeat(slow, 3)
+    poses = tuple(
+        gtsam.Pose3(gtsam.Rot3.Yaw(a), at) * gtsam.Pose3(gtsam.Rot3.Expmap(e[:3]), e[3:])
+        for a, at, e in zip(yaw, way, error, strict=True)
+    )
+    cov = np.tile(np.diag(np.repeat(said, 3) ** 2), (n, 1, 1))
+    stamps = np.round(1e9 * seconds).astype(np.int64)
+    return MotionData("drive/", poses=GivenPoses(stamps, poses, cov))
+
+
+def as_used(motion: MotionData) -> GivenTrajectory:
+    recording = cast(Recording, SimpleNamespace(name="drive/", lidars=(), motion=lambda: motion))
+    (trajectory,) = smooth_trajectories([recording], config_for(Sensors()), [[]], {0: motion})
+    assert isinstance(trajectory, GivenTrajectory)
+    return trajectory
+
+
+def test_the_scatter_of_poses_is_their_white_error() -> None:
+    found = scatter_of_poses(given_trajectory(localised((3e-4, 3e-3), (2e-3, 0.02), (1.0, 1.0))))
+
+    assert found == pytest.approx((3e-4, 3e-3), rel=0.1)
+
+
+def test_a_stated_error_that_is_mostly_slow_is_no_white_one() -> None:
+    slow = as_used(localised((3e-4, 3e-3), (2e-3, 0.02), (2e-3, 0.02)))
+    white = as_used(localised((2e-3, 0.02), (3e-4, 3e-3), (2e-3, 0.02)))
+
+    assert slow.error_covariances([0]) is None
+    (said,) = slow.warnings
+    assert "state errors of 0.11 degrees and 20 mm" in said
+    assert "scatter by at most 0.017 degrees and 3 mm" in said
+    assert white.error_covariances([0]) is not None
+    assert white.warnings == ()
+
+
+def test_rare_poses_keep_what_they_state() -> None:
+    # From one to the next a vehicle moves by more than their errors.
+    motion = localised((3e-4, 3e-3), (2e-3, 0.02), (2e-3, 0.02))
+    assert motion.poses is not None
+    assert motion.poses.cov is not None
+    rare = GivenPoses(
+        motion.poses.stamps_ns[::20], motion.poses.T_map_vehicle[::20], motion.poses.cov[::20]
+    )
+    assert scatter_of_poses(given_trajectory(MotionData("drive/", poses=rare))) is not None
+    assert as_used(MotionData("drive/", poses=rare)).error_covariances([0]) is not None
 
 
 SIGMAS = np.array([0.001, 0.002, 0.003, 0.01, 0.02, 0.03])

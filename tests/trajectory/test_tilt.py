@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
 
 from caliv_graph.config.model import Config
-from caliv_graph.products import Trajectory
+from caliv_graph.products import Array, Trajectory
 from caliv_graph.trajectory.select import GivenTrajectory
 from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.tilt import vehicle_tilt
 from caliv_graph.wording.physics import tilt_finding
 from scripts.show_hills import beside_a_hill
 from tests.trajectory.motions import Course, Sensors, config_for, eight_drive, record
+from tests.trajectory.test_wheels import beside_imu, settings
 
 CONFIG = config_for(Sensors())
 SPEED_M_S, RADIUS_M = 2.0, 9.0
@@ -144,6 +148,29 @@ def test_two_degrees_of_the_imu_are_said_with_their_sigma(
     # Who says that the vehicle leans is believed.
     config = leaning(*rpy_deg, parallel_sigma_deg=2.0)
     assert tilt_finding(vehicle_tilt(smoothed, motion.name, config), config) is None
+
+
+def test_heights_that_nobody_measured_are_no_climb(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A path that climbs by 8 degrees while the vehicle is level, as heights of an IMU alone do.
+    as_it_is = SmoothedTrajectory.poses_at
+
+    def climbing(self: SmoothedTrajectory, stamps_ns: Any) -> tuple[Array, Array]:
+        R, t = as_it_is(self, stamps_ns)
+        return R, t + 0.28 * 1e-9 * (np.asarray(stamps_ns) - self.nodes_ns[0])[:, None] * [0, 0, 1]
+
+    motion, config = beside_imu(1), settings()
+    found = {}
+    for fixes in (True, False):
+        of = motion if fixes else replace(motion, gnss=None)
+        smoothed = smooth_trajectory(of, config, [])
+        with monkeypatch.context() as patch:
+            patch.setattr(SmoothedTrajectory, "poses_at", climbing)
+            found[fixes] = vehicle_tilt(smoothed, of.name, config)
+
+    pitch_deg = {fixes: math.degrees(of.roll_pitch_rad[1]) for fixes, of in found.items()}
+    assert abs(pitch_deg[True]) > 3.0
+    assert abs(pitch_deg[False]) < 0.2
+    assert math.degrees(found[False].sigma_rad[1]) > 1.0
 
 
 @pytest.mark.parametrize("end_ns", [21_350_000_000, 36_390_000_000, 21_350_000_077])

@@ -40,6 +40,9 @@ class Solves:
     surface: Surface | None = None
     beside: CloudCount | None = None
     walls: frozenset[str] = frozenset({"a", "b"})
+    scale: float = 1.0
+    contradictions: tuple[str, ...] = ("clouds",)
+    suspects: tuple[float, ...] = (0.2,)
     left_out: list[list[str]] = field(default_factory=list)
     refused: list[TargetError | None] = field(default_factory=list)
 
@@ -53,8 +56,14 @@ class Solves:
             observation=SimpleNamespace(name="found at (1, 2) m"), surface=self.surface
         )
         run = SimpleNamespace(
-            calibration=SimpleNamespace(status="inconsistent" if first else self.second),
-            solution=SimpleNamespace(structure=self.structure, registrations=(seen,)),
+            calibration=SimpleNamespace(
+                status="inconsistent" if first else self.second,
+                contradictions=self.contradictions,
+                suspects=tuple(SimpleNamespace(sigmas=s) for s in self.suspects),
+            ),
+            solution=SimpleNamespace(
+                structure=self.structure, registrations=(seen,), registration_scale=self.scale
+            ),
             record=SimpleNamespace(trajectories=()),
         )
         return run, self.named
@@ -85,6 +94,12 @@ def test_a_bush_is_no_end_of_a_calibration_by_walls() -> None:
     assert "is none: the clouds of found at (1, 2) m show no surface" in str(solves.refused[1])
 
 
+def test_a_walker_whose_clouds_do_not_fit_each_other_is_none_either() -> None:
+    solves = Solves(count=counted(0, 0.0), scale=6.2)
+    assert solves.status(config_of()) == "ok"
+    assert "is none: its clouds fit only with registration errors 6 times" in str(solves.refused[1])
+
+
 @pytest.mark.parametrize("second", ["inconsistent", SolveError("nothing to solve")])
 def test_what_contradicts_walls_too_is_said_as_before(second: str | CalivError) -> None:
     solves = Solves(second)
@@ -104,8 +119,20 @@ def counted(outliers: int, offset_m: float) -> CloudCount:
         (Solves(named=True), config_of()),
         (Solves(count=counted(16, 0.1)), config_of()),
         (Solves(count=counted(6, 2.0)), config_of()),
+        (Solves(count=counted(0, 0.0), scale=4.9), config_of()),
+        (Solves(count=counted(0, 0.0), scale=6.2, suspects=(8.0, 1.0)), config_of()),
+        (Solves(count=counted(0, 0.0), scale=6.2, contradictions=("clouds", "walls")), config_of()),
     ],
-    ids=["a region is given", "no walls", "a mistake is named", "the same object", "a few clouds"],
+    ids=[
+        "a region is given",
+        "no walls",
+        "a mistake is named",
+        "the same object",
+        "a few clouds",
+        "clouds fit",
+        "a clock explains it",
+        "walls contradict, too",
+    ],
 )
 def test_else_a_contradiction_is_one(solves: Solves, config: Config) -> None:
     assert solves.status(config) == "inconsistent"

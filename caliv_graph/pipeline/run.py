@@ -52,11 +52,12 @@ from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
 from caliv_graph.uncertainty.consistency import (
     CONTRADICTION_SIGMAS,
+    SCALE_LIMIT,
     CloudCount,
     too_many_outliers,
     without_surface,
 )
-from caliv_graph.wording.contradictions import no_surface_text, outliers_text
+from caliv_graph.wording.contradictions import no_surface_text, outliers_text, scale_text
 from caliv_graph.wording.mounting import mistake_sentence
 from caliv_graph.wording.structure import (
     left_out_sentence,
@@ -64,6 +65,9 @@ from caliv_graph.wording.structure import (
     ranges_sentence,
     wrong_target_sentence,
 )
+
+SUSPECT_SIGMAS = 3.0
+"""Of an input of the config, from which it may explain clouds that do not fit each other."""
 
 
 def calibrate(
@@ -135,7 +139,8 @@ def no_target_of(run: CalibrationRun, config: Config) -> TargetError | None:
     """Why the object that the search found is no target; None: nothing speaks against it.
 
     Most clouds of a LiDAR lie elsewhere than the others: on the next object, or along a hedge. Or
-    none of the targets shows a surface, as foliage.
+    none of the targets shows a surface, as foliage. Or clouds do not fit each other, and nothing
+    else is contradicted, nor would another input of the config explain it: what stands there moves.
     """
     if run.calibration.status != "inconsistent" or config.target is not None:
         return None
@@ -144,6 +149,11 @@ def no_target_of(run: CalibrationRun, config: Config) -> TargetError | None:
     scattered = without_surface(surfaces(run.solution))
     if scattered and len(scattered) == len(run.solution.registrations):
         return TargetError(wrong_target_sentence("; ".join(map(no_surface_text, scattered))))
+    found = run.calibration
+    scale = run.solution.registration_scale
+    explained = any(of.sigmas > SUSPECT_SIGMAS for of in found.suspects)
+    if scale >= SCALE_LIMIT and len(found.contradictions) == 1 and not explained:
+        return TargetError(wrong_target_sentence(scale_text(scale)))
     for count in cloud_counts(run.solution, run.record.trajectories):
         off = count.offset_vehicle
         if (

@@ -253,6 +253,14 @@ def _where(count: CloudCount) -> str:
     return ""
 
 
+def scale_text(scale: float) -> str:
+    """That target clouds do not fit each other: their errors over what their points give."""
+    return (
+        f"its clouds fit only with registration errors {scale:.0f} times what the scatter of their "
+        f"points gives (limit {SCALE_LIMIT:.0f}), and no other input explains it"
+    )
+
+
 def _coarse(found: CoarseRegistrations, led: bool) -> str:
     rotation, shift = found.sigma
     likely = ""

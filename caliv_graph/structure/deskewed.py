@@ -46,16 +46,18 @@ to the other, and the surface in the map by less than this part of that."""
 MOST_PAIRS = 20
 """Of a scan that are looked at."""
 
-LEAST_SCANS = 5
-"""Scans that have to tell, and part of them that have to be nearer to the one answer:"""
+LEAST_SCANS = 8
+"""Scans that have to tell."""
 
-AGREEING = 0.75
+NEAR_SHARE, AGREEING = 0.35, 0.75
+"""How near to an answer the share of a scan is to count for it, and the part of the scans that has
+to: what is no wall, in an open place, has any share."""
 
 GUESS_SHARE = 0.1
 """1 sigma of the share beside its scatter: the guess of the LiDAR, walls that are no planes."""
 
-SIGMAS = 5.0
-"""Of the share from the other answer; and 3 of them from this one at most."""
+MOST_SHARE, SIGMAS = 0.25, 5.0
+"""How far the median may be from an answer; and it has to be so many sigmas from the other one."""
 
 
 @dataclass(frozen=True)
@@ -66,24 +68,26 @@ class MotionLeft:
         share: 1 as they were measured, 0 where they were deskewed; the median of the scans.
         sigma: of it.
         scans: that tell.
-        near_none: part of them that are nearer to 0 than to 1.
+        near_none: part of them that are near 0.
+        near_all: part of them that are near 1.
     """
 
     share: float
     sigma: float
     scans: int
     near_none: float
+    near_all: float
 
     @property
     def deskewed(self) -> bool:
         """Whether the points were deskewed."""
-        near = abs(self.share) < 3.0 * self.sigma and self.near_none >= AGREEING
+        near = abs(self.share) < MOST_SHARE and self.near_none >= AGREEING
         return near and 1.0 - self.share > SIGMAS * self.sigma
 
     @property
     def measured(self) -> bool:
         """Whether the points are as they were measured."""
-        near = abs(self.share - 1.0) < 3.0 * self.sigma and self.near_none <= 1.0 - AGREEING
+        near = abs(self.share - 1.0) < MOST_SHARE and self.near_all >= AGREEING
         return near and self.share > SIGMAS * self.sigma
 
 
@@ -120,10 +124,16 @@ def motion_left(
     for name, shares in found.items():
         if len(shares) < LEAST_SCANS:
             continue
-        median = float(np.median(shares))
-        scatter = 1.4826 * float(np.median(np.abs(np.array(shares) - median)))
-        sigma = float(np.hypot(1.25 * scatter / np.sqrt(len(shares)), GUESS_SHARE))
-        out[name] = MotionLeft(median, sigma, len(shares), float(np.mean(np.array(shares) < 0.5)))
+        of_each = np.array(shares)
+        median = float(np.median(of_each))
+        scatter = 1.4826 * float(np.median(np.abs(of_each - median)))
+        out[name] = MotionLeft(
+            share=median,
+            sigma=float(np.hypot(1.25 * scatter / np.sqrt(len(shares)), GUESS_SHARE)),
+            scans=len(shares),
+            near_none=float(np.mean(np.abs(of_each) < NEAR_SHARE)),
+            near_all=float(np.mean(np.abs(of_each - 1.0) < NEAR_SHARE)),
+        )
     return out
 
 

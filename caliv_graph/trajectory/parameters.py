@@ -18,6 +18,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import Array
 from caliv_graph.trajectory.chain import UNDETERMINED
 from caliv_graph.trajectory.inputs import GNSS_CLOCK, IMU_CLOCK, TWIST_CLOCK, SmootherInput
+from caliv_graph.trajectory.wheels import swing_rates
 
 XYZ = ("x", "y", "z")
 
@@ -124,6 +125,14 @@ def _slip_moved(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, axle_slip=data.axle_slip + float(d[0]))
 
 
+def _course_moved(data: SmootherInput, d: Array) -> SmootherInput:
+    assert data.motion.twist is not None
+    change = swing_rates(data.motion.twist, data.inertial.stamps_ns)
+    gyro = data.inertial.gyro.copy()
+    gyro[:, 2] += float(d[0]) * change
+    return replace(data, inertial=replace(data.inertial, gyro=gyro))
+
+
 def _lean_moved(data: SmootherInput, d: Array) -> SmootherInput:
     return replace(data, lean=data.lean + d)
 
@@ -186,6 +195,13 @@ AXLE_SLIP = InputParameter(
 )
 """Side slip of an axle per lateral acceleration, to the outside of a curve: how soft its tyres are.
 At a constant speed it is as if the axle were `slip v^2` further in the direction of travel."""
+
+COURSE_RATE = InputParameter(
+    "wheels.course", ("value",), "s^2/m", np.full(1, 1e-3), frozenset({"imu"}), _course_moved
+)
+"""What the yaw rate of wheels lacks of that of the body, per change of the lateral acceleration:
+nothing where wheels or a sensor measure it, `wheels.slip` where it is made from a steering angle,
+which gives the rate of the course."""
 
 LEAN = InputParameter(
     "wheels.lean",

@@ -24,6 +24,7 @@ from caliv_graph.trajectory.inputs import TWIST_CLOCK, SmootherInput
 from caliv_graph.trajectory.marginals import node_ordering
 from caliv_graph.trajectory.parameters import (
     AXLE_SLIP,
+    COURSE_RATE,
     GNSS_TIME_OFFSET,
     GYROSCOPE,
     HEADING_YAW,
@@ -143,6 +144,9 @@ def uncertain_parameters(data: SmootherInput) -> tuple[UncertainParameter, ...]:
         out.append(UncertainParameter(LEAN, np.array(LEAN_SIGMAS), np.zeros(2)))
         if data.wheels.planar:
             out.append(UncertainParameter(AXLE_SLIP, np.full(1, AXLE_SLIP_SIGMA), np.zeros(1)))
+            if data.wheels.yaw_rate:
+                sigma = np.full(1, AXLE_SLIP_SIGMA)
+                out.append(UncertainParameter(COURSE_RATE, sigma, np.zeros(1)))
     scale = data.speed_scale_sigma
     if scale is not None and data.motion.twist is not None:
         out.append(UncertainParameter(speed_scale(data), np.full(1, scale), np.zeros(1)))

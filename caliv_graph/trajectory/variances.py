@@ -36,6 +36,7 @@ from caliv_graph.trajectory.imu import bridged_s
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.parameters import (
     AXLE_SLIP,
+    COURSE_RATE,
     GNSS_TIME_OFFSET,
     GYROSCOPE,
     HEADING_YAW,
@@ -151,6 +152,7 @@ def estimated_scales(
     typed += [SPEEDS_DELAY] if data.speeds_delay_sigma_s else []
     if data.wheels is not None:
         typed += [LEAN, AXLE_SLIP] if data.wheels.planar else [LEAN]
+        typed += [COURSE_RATE] if data.wheels.planar and data.wheels.yaw_rate else []
     typed += [HEADING_YAW] if data.headings is not None else []
     typed += [SECOND_ARM] if data.baselines is not None else []
     columns = parameter_columns(data, nodes, part, graph, values, dropped, typed)

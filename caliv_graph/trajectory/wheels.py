@@ -95,6 +95,10 @@ def forward_alone(twist: TwistSamples) -> BoolArray:
     return ~(np.abs(twist.velocity[:, 0]) <= STANDING_M_S)
 
 
+SWING_NS = 200_000_000
+"""Over which speeds and yaw rates are averaged before and after an instant, for their change."""
+
+
 @dataclass(frozen=True)
 class WheelModel:
     """What is known of the axle's motion beside its speed.
@@ -150,6 +154,23 @@ def wheel_samples(twist: TwistSamples, name: str) -> tuple[Inertial, tuple[str, 
         known = np.isfinite(twist.yaw_rate)
         rates[:, 2:] = interpolate(at, twist.stamps_ns[known], twist.yaw_rate[known, None])
     return Inertial(at, rates, np.zeros((len(at), 3)), piece.gaps_ns), lines
+
+
+def swing_rates(twist: TwistSamples, at_ns: IntArray) -> Array:
+    """(m,) change of the lateral acceleration, forward positive in reverse too, m/s^3, at stamps.
+
+    Of speeds and yaw rates that are means over `SWING_NS`: steps of their numbers are no change.
+    """
+    assert twist.yaw_rate is not None
+    usable = np.isfinite(twist.velocity[:, 0]) & np.isfinite(twist.yaw_rate)
+    swing = np.abs(twist.velocity[usable, 0]) * twist.yaw_rate[usable]
+    stamps = np.asarray(twist.stamps_ns, np.int64)[usable]
+    seconds = (stamps - stamps[0]) * 1e-9
+    total = np.append(0.0, np.cumsum(0.5 * (swing[1:] + swing[:-1]) * np.diff(seconds)))
+    at = (at_ns - stamps[0]) * 1e-9
+    half = SWING_NS * 1e-9
+    ahead, here, behind = (np.interp(at + shift, seconds, total) for shift in (half, 0.0, -half))
+    return np.asarray((ahead - 2.0 * here + behind) / half**2)
 
 
 def wheel_noise(twist: TwistSamples, config: Config) -> ImuNoise:

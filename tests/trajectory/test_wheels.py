@@ -137,6 +137,36 @@ def test_an_axle_that_slips_in_curves_is_no_axle_elsewhere() -> None:
     assert abs(slips[0]) < 2.0 * sigmas[0]
 
 
+def test_a_yaw_rate_of_the_course_is_found_where_fixes_tell_the_course() -> None:
+    # A steering angle gives the rate of the course. That of the body, which slips by 8 mrad per
+    # m/s^2, is ahead of it where the lateral acceleration changes.
+    softness = 0.008
+    found = []
+    for lag in (0.0, softness):
+        motion = wheels(1)
+        assert motion.twist is not None
+        assert motion.twist.yaw_rate is not None
+        at = seconds(motion.twist.stamps_ns)
+        of = DRIVE.at(at)
+        swing = np.linalg.norm(of.velocity_map, axis=1) * of.rates[:, 2]
+        yaw_rate = motion.twist.yaw_rate - lag * np.gradient(swing, at)
+        motion = replace(motion, twist=replace(motion.twist, yaw_rate=yaw_rate))
+        found.append(smooth_trajectory(motion, settings(), stamps(DRIVE.duration_s, 5.0, 0.05)))
+    lags = [offset_of(each, "wheels.course") for each in found]
+    sigmas = found[1].sigmas_of("wheels.course")
+    assert sigmas is not None
+    told = 1.0 - (sigmas[0] / AXLE_SLIP_SIGMA) ** 2
+    assert told > 0.05
+    assert lags[1] - lags[0] == pytest.approx(told * softness, rel=0.35)
+    assert abs(lags[0]) < 2.0 * sigmas[0]
+
+
+def offset_of(found: SmoothedTrajectory, name: str) -> float:
+    (each,) = [p for p in found.parameters if p.parameter.name == name]
+    assert each.offset is not None
+    return float(each.offset[0])
+
+
 @pytest.mark.parametrize("speed", [2.0, -2.0])
 def test_an_axle_slips_to_the_outside_forwards_and_backwards(speed: float) -> None:
     # A circle to the left or, backwards, with the wheels to the left: its centre is on the left.

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import gtsam
 import numpy as np
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config, GroundConfig
-from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.geometry.se3 import vehicle_axes_difference
 from caliv_graph.pipeline import calibrate
 from caliv_graph.results.run import CalibrationRun
-from caliv_graph.trajectory.deskew import deskew
 from tests.drives_with_chair import Memory
 from tests.samples import pose
-from tests.structure.worlds import Spinner, World, driven, recorded, yard
+from tests.structure.worlds import Spinner, deskewed_before, driven, guessed, near_yard, recorded
 from tests.trajectory.motions import eight_drive
 
 TRUTH = {
@@ -29,27 +25,11 @@ OFF = gtsam.Pose3(gtsam.Rot3.Expmap(np.radians([1.0, -1.0, 2.0])), np.array([0.0
 
 
 def config() -> Config:
-    guesses = {name: T * OFF for name, T in TRUTH.items()}
     return Config(
-        lidars={
-            name: LidarConfig(
-                topic=name,
-                initial=PoseConfig(
-                    xyz=tuple(T.translation()), rpy_deg=tuple(np.degrees(T.rotation().rpy()))
-                ),
-            )
-            for name, T in guesses.items()
-        },
+        lidars=guessed({name: T * OFF for name, T in TRUTH.items()}),
         ground=GroundConfig(vehicle_height=0.0),
         target=False,
     )
-
-
-def near_yard() -> World:
-    """The yard with walls at three quarters of the distance: a sweep ends at them more often."""
-    walls = yard()
-    scale = np.array([0.75, 0.75, 1.0])
-    return World(scale * walls.corner, scale * walls.first, scale * walls.second)
 
 
 @cache
@@ -64,14 +44,7 @@ def deskewed_drive() -> Memory:
         "rear": Spinner(TRUTH["rear"], np.arange(-16.0, 10.0), around[200:400], sweep_s=0.03),
     }
     drive = recorded(near_yard(), way, lidars, dict.fromkeys(lidars, stamps))
-    clouds = {
-        name: tuple(
-            replace(deskew(scan, TRUTH[name], way), point_times_s=scan.point_times_s)
-            for scan in scans
-        )
-        for name, scans in drive.clouds.items()
-    }
-    return Memory(clouds, drive.poses)
+    return deskewed_before(drive, way, TRUTH)
 
 
 @cache

@@ -39,7 +39,7 @@ from caliv_graph.products import (
 from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.readers.empty import CountedRecording
 from caliv_graph.readers.pose_pauses import without_pauses
-from caliv_graph.readers.without_times import WithoutTimes
+from caliv_graph.readers.without_times import without_times
 from caliv_graph.structure.deskewed import motion_left
 from caliv_graph.structure.own_body import without_own_body
 from caliv_graph.structure.patches import DrivePatches
@@ -89,7 +89,6 @@ class Prepared:
         no_target: why no target was found; None: one was, or none was to be looked for.
         mistakes: of the config, that explain why LiDARs do not see the target, a sentence each.
         misplaced: beside `contradictions`, those of guesses that the search had to replace.
-        deskewed: LiDARs whose clouds were found to be deskewed before they were recorded.
     """
 
     trajectories: tuple[VehicleTrajectory, ...]
@@ -103,7 +102,6 @@ class Prepared:
     no_target: TargetError | None = None
     mistakes: tuple[str, ...] = ()
     misplaced: tuple[str, ...] = ()
-    deskewed: frozenset[str] = frozenset()
 
     def without_clouds(self, lidars: Collection[str]) -> Prepared:
         """The same without the target's clouds of some LiDARs, and targets of fewer than two."""
@@ -168,6 +166,7 @@ def prepare(
     """
     check_clouds(recordings, config)
     as_given = recordings, config
+    recordings = without_times(recordings, config)
     recordings = [CountedRecording(with_common_stamps(recording)) for recording in recordings]
     recordings, pauses = _with_poses(recordings, config, motions)
     raw = raw_findings(motions, config)
@@ -180,12 +179,9 @@ def prepare(
     deskewed, said = _deskewed(every_patch, rough, config, motions)
     if deskewed:
         del every_patch, rough, recordings, search, observations
-        prepared = prepare(*_as_deskewed(*as_given, deskewed), motions, progress, refused)
-        return replace(
-            prepared,
-            warnings=(*prepared.warnings, said),
-            deskewed=prepared.deskewed | deskewed,
-        )
+        given, asked = as_given
+        prepared = prepare(given, _with_deskewed(asked, deskewed), motions, progress, refused)
+        return replace(prepared, warnings=(*prepared.warnings, said))
     patches, of_body = _without_own_body(every_patch, rough, config)
     del every_patch
     observations = tuple(with_range_noise(o, patches) for o in observations)
@@ -363,16 +359,13 @@ def _deskewed(
     return frozenset([*told, *silent]), deskewed_sentence(figures, silent)
 
 
-def _as_deskewed(
-    recordings: Sequence[Recording], config: Config, deskewed: frozenset[str]
-) -> tuple[list[Recording], Config]:
-    """Drives without the times of the points of some LiDARs, and the config that says so."""
+def _with_deskewed(config: Config, deskewed: frozenset[str]) -> Config:
+    """The config that says so of some LiDARs."""
     lidars = {
         name: lidar.model_copy(update={"deskewed": True}) if name in deskewed else lidar
         for name, lidar in config.lidars.items()
     }
-    wrapped: list[Recording] = [WithoutTimes(recording, deskewed) for recording in recordings]
-    return wrapped, config.model_copy(update={"lidars": lidars})
+    return config.model_copy(update={"lidars": lidars})
 
 
 def _without_own_body(

@@ -46,7 +46,7 @@ from caliv_graph.products import (
     Recording,
 )
 from caliv_graph.readers.sampled import SampledRecording
-from caliv_graph.readers.without_times import WithoutTimes
+from caliv_graph.readers.without_times import without_times
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
@@ -193,8 +193,7 @@ def _calibrated(
     guessed = used if prior is None else starting_from(used, prior, digests, marks)
 
     prepared = prepare(recordings, guessed, motions, progress, refused)
-    if prepared.deskewed:
-        recordings = [WithoutTimes(recording, prepared.deskewed) for recording in sampled]
+    recordings = without_times(sampled, prepared.config)
     if left_out:
         prepared = prepared.without_clouds({count.lidar for count in left_out})
         notes = (*notes, *(left_out_sentence(outliers_text(count)) for count in left_out))
@@ -270,8 +269,9 @@ def _calibrated(
 
 def _scene(recording: SampledRecording, prepared: Prepared) -> tuple[LidarScan, ...]:
     """Scans of a drive for the report, moved as the calibration moves them."""
+    lidars = prepared.config.lidars
     return tuple(
-        replace(scan, point_times_s=None) if scan.lidar in prepared.deskewed else scan
+        replace(scan, point_times_s=None) if lidars[scan.lidar].deskewed is True else scan
         for scan in recording.kept()
     )
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from caliv_graph.products import LidarScan
+from caliv_graph.config.model import Config
+from caliv_graph.products import LidarScan, Recording
 from caliv_graph.readers.forwarding import ForwardingRecording
+
+
+def without_times(recordings: Sequence[Recording], config: Config) -> list[Recording]:
+    """Drives without the times of the points of LiDARs whose clouds the config calls deskewed."""
+    deskewed = frozenset(name for name, of in config.lidars.items() if of.deskewed is True)
+    return [WithoutTimes(of, deskewed) if deskewed else of for of in recordings]
 
 
 @dataclass(frozen=True)

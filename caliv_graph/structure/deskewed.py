@@ -16,6 +16,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
+from caliv_graph.common.statistics import MAD
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import cross, stack
 from caliv_graph.products import Array, BoolArray, IntArray
@@ -126,7 +127,7 @@ def motion_left(
             continue
         of_each = np.array(shares)
         median = float(np.median(of_each))
-        scatter = 1.4826 * float(np.median(np.abs(of_each - median)))
+        scatter = MAD * float(np.median(np.abs(of_each - median)))
         out[name] = MotionLeft(
             share=median,
             sigma=float(np.hypot(1.25 * scatter / np.sqrt(len(shares)), GUESS_SHARE)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from caliv_graph.common.statistics import MAD
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.interpolation import PoseCurve
@@ -70,7 +71,7 @@ def scatter_of_poses(trajectory: Trajectory) -> tuple[float, float] | None:
     turns = log_so3(np.swapaxes(R[:-1], 1, 2) @ R[1:])
     found = []
     for third in (np.diff(turns, n=2, axis=0)[even], np.diff(t, n=3, axis=0)[even]):
-        spread = 1.4826 * np.median(np.abs(third - np.median(third, axis=0)), axis=0)
+        spread = MAD * np.median(np.abs(third - np.median(third, axis=0)), axis=0)
         found.append(float(np.sqrt(np.mean(spread**2) / 20.0)))
     return found[0], found[1]
 

@@ -256,9 +256,13 @@ def _where(count: CloudCount) -> str:
 def scale_text(scale: float) -> str:
     """That target clouds do not fit each other: their errors over what their points give."""
     return (
-        f"its clouds fit only with registration errors {scale:.0f} times what the scatter of their "
-        f"points gives (limit {SCALE_LIMIT:.0f}), and no other input explains it"
+        f"its clouds fit only with registration errors {_times_scatter(scale)}, and no other input "
+        "explains it"
     )
+
+
+def _times_scatter(scale: float) -> str:
+    return f"{scale:.0f} times what the scatter of their points gives (limit {SCALE_LIMIT:.0f})"
 
 
 def _coarse(found: CoarseRegistrations, led: bool) -> str:
@@ -274,8 +278,8 @@ def _coarse(found: CoarseRegistrations, led: bool) -> str:
     return (
         f"the target clouds (lidars {names}) and the motion of the vehicle contradict each other: "
         f"they fit only with registration errors of {1e3 * rotation:.0f} mrad and "
-        f"{1e3 * shift:.0f} mm, {found.scale:.0f} times what the scatter of their points gives "
-        f"(limit {SCALE_LIMIT:.0f}).{likely}{'' if led else _COARSE_REMEDY}"
+        f"{1e3 * shift:.0f} mm, {_times_scatter(found.scale)}.{likely}"
+        f"{'' if led else _COARSE_REMEDY}"
     )
 
 

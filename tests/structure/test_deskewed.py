@@ -10,34 +10,32 @@ import numpy as np
 import pytest
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config
-from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.products import Array, BoolArray
 from caliv_graph.structure.deskewed import MotionLeft, motion_left
 from caliv_graph.structure.patches import DrivePatches, Swept
 from caliv_graph.structure.read import read_patches
-from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import GivenTrajectory
-from tests.drives_with_chair import Memory
 from tests.samples import pose
-from tests.structure.worlds import Spinner, World, driven, ground, recorded, world_of, yard
+from tests.structure.worlds import (
+    Spinner,
+    World,
+    deskewed_before,
+    driven,
+    ground,
+    guessed,
+    near_yard,
+    recorded,
+    world_of,
+    yard,
+)
 from tests.trajectory.motions import eight_drive
 
 TRUTH = pose((1.0, 0.3, 1.8), (2.0, 3.0, 20.0))
 OFF = gtsam.Pose3(gtsam.Rot3.Expmap(np.radians([1.5, -1.0, 3.0])), np.array([0.1, -0.1, 0.05]))
 GUESS = TRUTH * OFF
 EIGHT = driven(eight_drive())
-CONFIG = Config(
-    lidars={
-        "roof": LidarConfig(
-            topic="roof",
-            initial=PoseConfig(
-                xyz=tuple(GUESS.translation()), rpy_deg=tuple(np.degrees(GUESS.rotation().rpy()))
-            ),
-        )
-    }
-)
+CONFIG = Config(lidars=guessed({"roof": GUESS}))
 
 
 def spinner(degrees: float = 360.0, sweep_s: float = 0.1) -> Spinner:
@@ -54,24 +52,13 @@ def read(world: World, trajectory: GivenTrajectory, lidar: Spinner, moved: bool)
     stamps = np.arange(begin + 100_000_000, end - 100_000_000, 750_000_000, dtype=np.int64)
     recording = recorded(world, trajectory, {"roof": lidar}, {"roof": stamps})
     if moved:
-        clouds = tuple(
-            replace(deskew(scan, TRUTH, trajectory), point_times_s=scan.point_times_s)
-            for scan in recording.clouds["roof"]
-        )
-        recording = Memory({"roof": clouds}, recording.poses)
+        recording = deskewed_before(recording, trajectory, {"roof": TRUTH})
     (patches,) = read_patches([recording], [trajectory], CONFIG, SilentProgress(), keep_level=True)
     return patches
 
 
 def told(patches: DrivePatches, trajectory: GivenTrajectory = EIGHT) -> MotionLeft | None:
     return motion_left([patches], [trajectory], {"roof": GUESS}).get("roof")
-
-
-def near_yard() -> World:
-    """The yard with walls at three quarters of the distance: a sweep ends at them more often."""
-    walls = yard()
-    scale = np.array([0.75, 0.75, 1.0])
-    return World(scale * walls.corner, scale * walls.first, scale * walls.second)
 
 
 @cache

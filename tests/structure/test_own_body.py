@@ -11,9 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from caliv_graph.common.progress import SilentProgress
-from caliv_graph.config.lidars import LidarConfig
 from caliv_graph.config.model import Config, GroundConfig
-from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, BoolArray, Trajectory
 from caliv_graph.structure.own_body import _above_ground, _in_map, without_own_body
@@ -21,7 +19,17 @@ from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.read import read_patches
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.samples import pose
-from tests.structure.worlds import Spinner, World, driven, ground, recorded, wall, world_of, yard
+from tests.structure.worlds import (
+    Spinner,
+    World,
+    driven,
+    ground,
+    guessed,
+    recorded,
+    wall,
+    world_of,
+    yard,
+)
 from tests.trajectory.motions import eight_drive
 
 DECK_M = 1.2
@@ -35,17 +43,7 @@ GUESSES = {
     "rear": pose((-1.0, 0.1, 1.9), (0.0, 10.0, 175.0)),
 }
 AROUND = np.linspace(-180.0, 180.0, 300, endpoint=False)
-CONFIG = Config(
-    lidars={
-        name: LidarConfig(
-            topic=name,
-            initial=PoseConfig(
-                xyz=tuple(T.translation()), rpy_deg=tuple(np.degrees(T.rotation().rpy()))
-            ),
-        )
-        for name, T in GUESSES.items()
-    }
-)
+CONFIG = Config(lidars=guessed(GUESSES))
 
 
 STATED = CONFIG.model_copy(update={"ground": GroundConfig(vehicle_height=0.0)})

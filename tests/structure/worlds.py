@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 
+from caliv_graph.config.lidars import LidarConfig
+from caliv_graph.config.mounting import PoseConfig
 from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.geometry.se3 import stack
 from caliv_graph.products import Array, GivenPoses, IntArray, LidarScan, Trajectory
 from caliv_graph.scenario.drives import Drive
+from caliv_graph.trajectory.deskew import deskew
 from caliv_graph.trajectory.select import GivenTrajectory
 from tests.drives_with_chair import Memory
 
@@ -74,6 +77,25 @@ def yard() -> World:
         x, y = far * math.cos(math.radians(angle)), far * math.sin(math.radians(angle))
         walls.append(wall(x + 2.0, 1.5 * y, angle + 90.0 + turned, length))
     return world_of(ground(), *walls)
+
+
+def near_yard() -> World:
+    """The yard with walls at three quarters of the distance: a sweep ends at them more often."""
+    walls, scale = yard(), np.array([0.75, 0.75, 1.0])
+    return World(scale * walls.corner, scale * walls.first, scale * walls.second)
+
+
+def guessed(guesses: Mapping[str, gtsam.Pose3]) -> dict[str, LidarConfig]:
+    """LiDARs of a config with these initial guesses."""
+    return {
+        name: LidarConfig(
+            topic=name,
+            initial=PoseConfig(
+                xyz=tuple(T.translation()), rpy_deg=tuple(np.degrees(T.rotation().rpy()))
+            ),
+        )
+        for name, T in guesses.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -162,3 +184,17 @@ def recorded(
     }
     of = trajectory.trajectory
     return Memory(clouds, GivenPoses(of.stamps_ns, of.T_map_vehicle))
+
+
+def deskewed_before(
+    drive: Memory, trajectory: GivenTrajectory, truth: Mapping[str, gtsam.Pose3]
+) -> Memory:
+    """The drive with clouds that a driver has deskewed, and whose points keep their times."""
+    clouds = {
+        name: tuple(
+            replace(deskew(scan, truth[name], trajectory), point_times_s=scan.point_times_s)
+            for scan in scans
+        )
+        for name, scans in drive.clouds.items()
+    }
+    return replace(drive, clouds=clouds)

@@ -25,6 +25,7 @@ from caliv_graph.structure.noise import (
     range_sigmas,
     seen_signs,
 )
+from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.problem import (
     Problem,
     add_hold,
@@ -67,6 +68,12 @@ STEPS = (2, LAST_STEPS)
 
 SMALL_SIGMAS = 0.02
 """Step in standard deviations of the extrinsics at which the solve has converged."""
+
+WILD_GATES = 0.5
+"""Last step of a round, in gates at the median range of the patches, up to which strips may be cut
+anew. A wild one passes: with the noise levels of the round before, a rosette that looks back along
+a street was turned by -9 mrad, and by the next step back. Cut between the two, walls and window
+frames were joined as if the LiDAR were 45 mm aside, and it stayed there (S2S at 8.8 sigmas)."""
 
 
 Pair = tuple[float, float]
@@ -288,7 +295,7 @@ def solve_structure(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solve
         found = _round(own, state, range_sigma, gate, levels)
         if found is None:
             return None
-        found = without_residuals(_settled(found, steps))
+        found = without_residuals(_settled(found, steps, tame_m=WILD_GATES * gate))
         levels, state = found.levels(), found.state
     if found is None:
         return None
@@ -323,7 +330,8 @@ def solve_roughly(problem: Problem, start: Mapping[str, gtsam.Pose3]) -> Solved 
     found = _round(problem, state, range_sigma, GATES_M[0], levels)
     if found is None:
         return None
-    found, gradient = _with_gradient(_settled(found, STEPS[0]))
+    settled = _settled(found, STEPS[0], tame_m=WILD_GATES * GATES_M[0])
+    found, gradient = _with_gradient(settled)
     return _on_all_poses([found], problem, np.arange(len(problem.prior.stamps_ns)), gradient)
 
 
@@ -362,7 +370,7 @@ def _rough(
         found = _round(some, rough, range_sigma, gate, levels)
         if found is None:
             break
-        found = without_residuals(_settled(found, steps=2, tilts=False))
+        found = without_residuals(_settled(found, 2, tame_m=WILD_GATES * gate, tilts=False))
         levels = replace(found.levels(), beams=None, bend_per_m=levels.bend_per_m)
         rough, beam = found.state, found.layout.beam
     if len(rough.errors):
@@ -510,27 +518,35 @@ def _round(
 
 
 def _settled(
-    found: Estimate, steps: int, systems: list[System] | None = None, tilts: bool = True
+    found: Estimate,
+    steps: int,
+    systems: list[System] | None = None,
+    tame_m: float = math.inf,
+    tilts: bool = True,
 ) -> Sighted:
     """Gauss-Newton steps; after each one the noise levels and the robust weights.
 
-    The system of the first step is taken out of `systems`, where it is there.
+    The system of the first step is taken out of `systems`, where it is there. While a step moves
+    patches by more than `tame_m` there may be more than `steps`, up to `LAST_STEPS`.
     """
     held = [with_residuals(found)]
-    for number in range(steps):
+    for number in range(max(steps, LAST_STEPS)):
         # New strips, and each step, leave behind in pieces what the next one would come on top of.
         give_back_freed_memory()
-        size = _step(held, systems or [], tilts)
+        size, moved_m = _step(held, systems or [], tilts)
         if number > 0 and size < SMALL_SIGMAS:
             return replace(held.pop(), converged=True)
+        if number + 1 >= steps and moved_m <= tame_m:
+            break
     return replace(held.pop(), converged=False)
 
 
-def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
+def _step(held: list[Sighted], systems: list[System], tilts: bool) -> tuple[float, float]:
     """Puts the estimate after a step in the place of the one in `held`.
 
-    Returns the size of the step in sigmas of the extrinsics. The system is taken out of `systems`,
-    where it is there.
+    Returns the size of the step in sigmas of the extrinsics, and by how many metres it moves the
+    patches of some LiDAR, those of median range. The system is taken out of `systems`, where it is
+    there.
     """
     found = without_residuals(held[0])
     problem, layout, sightings = found.problem, found.layout, found.sightings
@@ -570,7 +586,17 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> float:
     step = d[layout.extrinsic : layout.error]
     cov = covariance_of(factor, np.arange(layout.extrinsic, layout.error))
     held.append(replace(after, weights=weights, nuisances=nuisances, unbent=unbent))
-    return math.sqrt(float(step @ np.linalg.solve(cov, step)))
+    sigmas = math.sqrt(float(step @ np.linalg.solve(cov, step)))
+    turns, shifts = np.linalg.norm(step.reshape(-1, 2, 3), axis=2).T
+    return sigmas, float(np.max(turns * _reach_m(problem.patches) + shifts))
+
+
+def _reach_m(patches: DrivePatches) -> Array:
+    """(L,) median range of the patches of each LiDAR; zero of one that has none."""
+    centres = patches.moments[:, :3, 3] / patches.moments[:, 3, 3, None]
+    range_m, own = np.linalg.norm(centres, axis=1), patches.scan_lidar[patches.scan]
+    per_lidar = [range_m[own == of] for of in range(len(patches.lidars))]
+    return np.array([np.median(of) if len(of) else 0.0 for of in per_lidar])
 
 
 def _factor(found: Estimate, system: System) -> tuple[tuple[Array, Array], Array]:

@@ -440,6 +440,35 @@ def test_one_estimate_at_a_time_has_residuals_and_none_while_surfaces_are_elimin
     assert len(made) >= len(systems) > 8
 
 
+@pytest.mark.parametrize(
+    ("moved_m", "steps"),
+    [
+        ([0.5, 0.02, 0.4], 2),
+        ([0.01, 0.4, 0.02, 0.4], 3),
+        ([0.4] * 9, solving.LAST_STEPS),
+    ],
+)
+def test_no_strips_are_cut_in_the_middle_of_a_wild_step(
+    monkeypatch: pytest.MonkeyPatch, solved: Solved, moved_m: list[float], steps: int
+) -> None:
+    left = list(moved_m)
+    monkeypatch.setattr(solving, "_step", lambda *_: (1.0, left.pop(0)))
+    found = solving._settled(solving.without_residuals(solved), 2, tame_m=0.03)
+    assert len(moved_m) - len(left) == steps
+    assert not found.converged
+
+
+def test_a_step_says_by_how_much_it_moves_patches(solved: Solved) -> None:
+    """10 mrad at the median range of 10 to 20 m, back to where the LiDAR was."""
+    found, turned = solving.without_residuals(solved), gtsam.Pose3(gtsam.Rot3.Rz(0.01), [0, 0, 0])
+    at = found.state.T_vehicle_lidar
+    state = replace(found.state, T_vehicle_lidar=(at[0], at[1].compose(turned)))
+    held = [solving.with_residuals(replace(found, state=state))]
+    sigmas, moved_m = solving._step(held, [], tilts=True)
+    assert 0.07 < moved_m < 0.25
+    assert sigmas > 10.0
+
+
 def test_residuals_of_some_sightings_at_a_time_are_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -16,6 +16,7 @@ from caliv_graph.calibration.noise import (
     expected_noise,
     first_pose_noise,
 )
+from caliv_graph.calibration.problem import slow_stated
 from caliv_graph.calibration.structure_evidence import ToldErrors
 from caliv_graph.calibration.variance_components import Observed
 from caliv_graph.calibration.vehicle_parameters import pose_clock_prior
@@ -44,6 +45,7 @@ def noise_by_structure(
         config.noise,
         open_levels=(walls.unstated, True),
         of_messages=None if walls.unstated else np.concatenate(stated),
+        slow_stated=slow_stated(trajectories),
     )
 
 

@@ -55,6 +55,10 @@ TYPICAL = PoseNoise(
 LOG_SPREAD = math.log(10.0)
 """1 sigma of the log-normal prior about the sigmas of `TYPICAL`: a factor of ten."""
 
+STATED_SPREAD = math.log(2.0)
+"""The same about the sigmas of slow errors that messages state: a localiser knows them to that.
+Over a short drive they pass for a clock of the poses, or for LiDARs that are apart."""
+
 TIME_SPREAD = math.log(3.0)
 """The same about its time."""
 
@@ -211,6 +215,7 @@ def fit_pose_noise(
         config,
         open_levels=(unstated, some),
         of_messages=of_messages,
+        slow_stated=problem.slow_stated,
     )
     if not clouds:
         return noise, TYPICAL_SCALE
@@ -228,6 +233,7 @@ def expected_noise(
     *,
     open_levels: tuple[bool, bool] = (True, True),
     of_messages: Array | None = None,
+    slow_stated: tuple[float | None, float | None] = (None, None),
 ) -> PoseNoise:
     """The noise of given poses by residuals that it moves.
 
@@ -241,15 +247,24 @@ def expected_noise(
         config: what is stated there is kept.
         open_levels: whether white and whether Gauss-Markov sigmas are to be found; else `TYPICAL`.
         of_messages: (n, 6, 6) white errors of all poses, if messages state them.
+        slow_stated: sigmas of Gauss-Markov errors, rotation (rad) and position (m), that messages
+            state; None: nothing.
     """
     fixed, unknowns = _configured(config), list[Unknown]()
     needed = np.repeat(open_levels, 2).tolist()
-    for need, value, median, low, high in zip(
-        needed, fixed, astuple(TYPICAL)[:4], FLOORS, CEILINGS, strict=True
+    for need, value, typical, told, low, high in zip(
+        needed,
+        fixed,
+        astuple(TYPICAL)[:4],
+        (None, None, *slow_stated),
+        FLOORS,
+        CEILINGS,
+        strict=True,
     ):
+        median, spread = (typical, LOG_SPREAD) if told is None else (told, STATED_SPREAD)
         kept = median if value is None else value
         free = need and value is None
-        unknowns.append(Unknown(kept, LOG_SPREAD, (low, high) if free else (kept, kept)))
+        unknowns.append(Unknown(kept, spread, (low, high) if free else (kept, kept)))
     levels, of_clouds = len(unknowns), list[list[Component]]()
     for of in evidence:
         if not of.clouds:

@@ -96,6 +96,8 @@ class Problem:
         stated_cov: (n, 6, 6) covariance of the white error of each given pose as its message states
             it, rotation in vehicle axes, position in map axes; NaN: not stated. None: no pose has
             one.
+        slow_stated: 1 sigma of the slow errors of given poses, rotation (rad) and position (m),
+            that their messages state; None: nothing.
         views: (J,) clouds of its LiDAR that have the view of each (`targets.cloud.views`); None:
             all differ.
         heave_m: 1 sigma of the heave at each pose.
@@ -130,6 +132,7 @@ class Problem:
     twists: Array | None = None
     accelerations: Array | None = None
     stated_cov: Array | None = None
+    slow_stated: tuple[float | None, float | None] = (None, None)
     views: Array | None = None
     heave_m: float = field(default_factory=usual_heave_m)
     floors: Array = field(default_factory=partial(ground_floors, NoiseConfig()))
@@ -426,6 +429,7 @@ def pose_problem(
         twists=np.concatenate(twists) if twists else None,
         accelerations=np.concatenate(accelerations) if accelerations else None,
         stated_cov=_stated_covariances(trajectories, poses, config),
+        slow_stated=slow_stated(trajectories),
         views=np.concatenate([np.ones(0), *(_views(o, of_pose, config) for o in observations)]),
         heave_m=heave_m,
         floors=floors,
@@ -482,6 +486,22 @@ def _views(
             places.append(T.transformTo(observation.centre_map))
         out[own] = views(np.array(places))
     return out
+
+
+def slow_stated(
+    trajectories: Sequence[VehicleTrajectory],
+) -> tuple[float | None, float | None]:
+    """1 sigma of slow errors of rotation (rad) and position (m) that given poses state.
+
+    The root mean square over the drives that state one; None: none does.
+    """
+    told = [t.slow_stated for t in trajectories if isinstance(t, GivenTrajectory)]
+    turns = [turn for turn, _ in told if turn is not None]
+    places = [place for _, place in told if place is not None]
+    return (
+        float(np.sqrt(np.mean(np.square(turns)))) if turns else None,
+        float(np.sqrt(np.mean(np.square(places)))) if places else None,
+    )
 
 
 def _stated_covariances(

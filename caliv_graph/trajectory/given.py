@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from caliv_graph.common.statistics import MAD
@@ -76,10 +78,30 @@ def scatter_of_poses(trajectory: Trajectory) -> tuple[float, float] | None:
     return found[0], found[1]
 
 
-def slow_errors_stated(
-    trajectory: Trajectory,
-) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """What poses state (rad, m) and what they scatter by at most, if the first is no white error.
+@dataclass(frozen=True)
+class SlowStated:
+    """What the messages of poses state, where that is mostly a slow error; 1 sigma per axis.
+
+    Attributes:
+        stated: of rotation (rad) and of position (m), the median over the poses.
+        scatter: what they scatter by at most (`scatter_of_poses`).
+    """
+
+    stated: tuple[float, float]
+    scatter: tuple[float, float]
+
+    @property
+    def slow(self) -> tuple[float | None, float | None]:
+        """Of rotation and position what is stated of slow errors; None: it may be white as well."""
+        turn, place = (
+            of if of > MOSTLY_SLOW * most else None
+            for of, most in zip(self.stated, self.scatter, strict=True)
+        )
+        return turn, place
+
+
+def slow_errors_stated(trajectory: Trajectory) -> SlowStated | None:
+    """What poses state and what they scatter by at most, if the first is no white error.
 
     A localiser states how far it may be off. That error is mostly slow: taken as white it leaves
     nothing for the slow one, and a hundred poses would know the vehicle ten times as well. None:
@@ -92,8 +114,8 @@ def slow_errors_stated(
         return None
     variances = np.median(np.diagonal(known, axis1=1, axis2=2), axis=0)
     said = float(np.sqrt(variances[:3].mean())), float(np.sqrt(variances[3:].mean()))
-    slow = any(of > MOSTLY_SLOW * at_most for of, at_most in zip(said, scatter, strict=True))
-    return (said, scatter) if slow else None
+    found = SlowStated(said, scatter)
+    return None if found.slow == (None, None) else found
 
 
 def rare_poses(trajectory: Trajectory, stamps_ns: IntArray) -> tuple[float, float] | None:

@@ -72,12 +72,15 @@ class GivenTrajectory:
         warnings: a line each.
         odometry: the poses, if the odometry of a LiDAR gave them: then they are no evidence of
             where a LiDAR is on the vehicle. None: they came with the recording.
+        slow_stated: 1 sigma per axis of the slow errors of rotation (rad) and position (m) that
+            their messages state in the place of white ones (`given.SlowStated`); None: neither.
     """
 
     trajectory: Trajectory
     lost_ns: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
     odometry: OdometryPoses | None = None
+    slow_stated: tuple[float | None, float | None] = (None, None)
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -200,12 +203,13 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
         )
     slow = slow_errors_stated(trajectory)
     if slow is not None:
-        (turn, place), (turn_most, place_most) = slow
+        (turn, place), (turn_most, place_most) = slow.stated, slow.scatter
         warnings.append(
             f"{motion.name}: the vehicle's poses state errors of {math.degrees(turn):.2g} degrees "
             f"and {1e3 * place:.2g} mm, and from one to the next they scatter by at most "
             f"{math.degrees(turn_most):.2g} degrees and {1e3 * place_most:.2g} mm: what they state "
-            "is mostly a slow error. White and slow errors of the poses are estimated instead"
+            "is mostly a slow error. White and slow errors of the poses are estimated, the slow "
+            "ones about what is stated"
         )
         trajectory = replace(trajectory, cov=None)
     rare = rare_poses(trajectory, stamps)
@@ -216,7 +220,8 @@ def _given(motion: MotionData, stamps: IntArray) -> GivenTrajectory:
             f"them its path is known to about {1e3 * sigma_m:.0f} mm. Give poses more often"
         )
     odometry = motion.poses if isinstance(motion.poses, OdometryPoses) else None
-    return GivenTrajectory(trajectory, tuple(lost.tolist()), tuple(warnings), odometry)
+    slow_stated = (None, None) if slow is None else slow.slow
+    return GivenTrajectory(trajectory, tuple(lost.tolist()), tuple(warnings), odometry, slow_stated)
 
 
 def accelerations_at(trajectory: VehicleTrajectory, stamps_ns: Sequence[int]) -> Array:

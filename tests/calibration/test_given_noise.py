@@ -14,6 +14,7 @@ import pytest
 from caliv_graph.calibration.given_noise import noise_by_structure, residuals_of_structure
 from caliv_graph.calibration.graph import with_given_poses
 from caliv_graph.calibration.noise import TYPICAL, fit_pose_noise
+from caliv_graph.calibration.problem import slow_stated
 from caliv_graph.calibration.structure_evidence import NOTHING_TOLD, ToldErrors
 from caliv_graph.config.load import parse_config
 from caliv_graph.config.model import Config
@@ -55,7 +56,7 @@ def errors(noise: PoseNoise, rng: np.random.Generator) -> Array:
     return np.asarray(drawn[0] * white + half @ drawn[1] * slow)
 
 
-def told(seed: int, noise: PoseNoise, late_s: float = 0.0) -> ToldErrors:
+def told(seed: int, noise: PoseNoise, late_s: float = 0.0, seen: Array = SEEN) -> ToldErrors:
     """Structure that knows all poses but for a shift and a turn of all on the vehicle."""
     rng, given = np.random.default_rng(seed), circle()
     off = errors(noise, rng)
@@ -63,12 +64,12 @@ def told(seed: int, noise: PoseNoise, late_s: float = 0.0) -> ToldErrors:
         off[i, 3:] = T.rotation().matrix().T @ off[i, 3:]
     off[:, 3] += 2.0 * late_s
     off[:, 2] += 2.0 / 15.0 * late_s
-    seen = (off + SEEN * rng.standard_normal(off.shape)).ravel()
-    information = np.diag(np.tile(SEEN**-2.0, POSES))
+    residuals = (off + seen * rng.standard_normal(off.shape)).ravel()
+    information = np.diag(np.tile(seen**-2.0, POSES))
     # Extrinsics take up what is the same in all poses, vehicle axes.
     common = information @ np.tile(np.eye(6), (POSES, 1))
     information -= common @ np.linalg.solve(np.tile(np.eye(6), POSES) @ common, common.T)
-    return ToldErrors({0: (information, -information @ seen)})
+    return ToldErrors({0: (information, -information @ residuals)})
 
 
 def found_by(of: ToldErrors, config: Config) -> PoseNoise:
@@ -111,6 +112,29 @@ def test_what_is_stated_is_kept_and_nothing_told_is_the_usual() -> None:
     assert (found.drift_position_m, found.drift_time_s) == (0.015, 12.0)
     assert found.white_position_m == pytest.approx(4e-3, rel=0.5)
     assert noise_by_structure(NOTHING_TOLD, {}, [], config()) == TYPICAL
+
+
+def test_slow_errors_that_messages_state_stand_where_the_drive_tells_little() -> None:
+    """Structure that knows poses to 0.3 m and 50 mrad, and one that knows them to a millimetre."""
+    stating = replace(circle(), slow_stated=(None, 0.015))
+    vague = told(1, TRUE, seen=np.array([0.05] * 3 + [0.3] * 3))
+
+    def by(of: ToldErrors, trajectory: GivenTrajectory) -> float:
+        drives = {0: STAMPS_NS}
+        return noise_by_structure(of, drives, [trajectory], config()).drift_position_m
+
+    assert by(vague, stating) == pytest.approx(0.015, rel=0.3)
+    assert by(vague, circle()) < 0.008
+    # What it states, five times too much, against 48 poses that say otherwise.
+    wrong = replace(circle(), slow_stated=(None, 0.075))
+    assert by(told(1, TRUE), wrong) < 0.025
+
+
+def test_slow_errors_are_of_the_drives_that_state_some() -> None:
+    drives = [replace(circle(), slow_stated=of) for of in ((3e-3, None), (4e-3, 0.02))]
+
+    assert slow_stated([circle(), *drives]) == pytest.approx((math.sqrt(12.5e-6), 0.02))
+    assert slow_stated([circle()]) == (None, None)
 
 
 def test_white_errors_that_messages_state_are_known() -> None:

@@ -91,11 +91,21 @@ def test_a_stated_error_that_is_mostly_slow_is_no_white_one() -> None:
     white = as_used(localised((2e-3, 0.02), (3e-4, 3e-3), (2e-3, 0.02)))
 
     assert slow.error_covariances([0]) is None
+    assert slow.slow_stated == pytest.approx((2e-3, 0.02))
+    assert white.slow_stated == (None, None)
     (said,) = slow.warnings
     assert "state errors of 0.11 degrees and 20 mm" in said
     assert "scatter by at most 0.017 degrees and 3 mm" in said
     assert white.error_covariances([0]) is not None
     assert white.warnings == ()
+
+
+def test_a_rotation_that_scatters_as_it_is_stated_tells_no_slow_error() -> None:
+    found = as_used(localised((2e-3, 3e-3), (3e-4, 0.02), (2e-3, 0.02)))
+
+    turn, place = found.slow_stated
+    assert turn is None
+    assert place == pytest.approx(0.02)
 
 
 def test_rare_poses_keep_what_they_state() -> None:

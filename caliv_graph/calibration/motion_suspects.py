@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-import scipy.linalg
 
-from caliv_graph.errors import TrajectoryError
+from caliv_graph.errors import SolveError, TrajectoryError
 from caliv_graph.products import Array, IntArray
+from caliv_graph.structure.elimination import factor_of, solved
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.trajectory.suspects import SuspectParameter, misfit, with_suspects
@@ -109,12 +109,14 @@ def _part(
     offset = np.concatenate([s.offset for s in suspects])
     of_poses = joint.information[:split, :split]
     try:
-        factor = scipy.linalg.cho_factor(of_poses)
-    except scipy.linalg.LinAlgError:
+        # Scans of two LiDARs may be 2 ms apart, and their heights known to each other to a
+        # micrometre, on a map whose own height nothing tells: rounding makes that indefinite.
+        factor = factor_of(of_poses)
+    except SolveError:
         raise TrajectoryError("the motion data leave the vehicle's poses undetermined") from None
     cross = joint.information[:split, split:]
-    follow = -scipy.linalg.cho_solve(factor, cross)
-    shift = scipy.linalg.cho_solve(factor, joint.gradient[:split])
+    follow = -solved(factor, cross)
+    shift = solved(factor, joint.gradient[:split])
     own = joint.information[split:, split:] + cross.T @ follow
     gradient = joint.gradient[split:] - cross.T @ shift
     # From the estimate's parameters to those that the user typed.

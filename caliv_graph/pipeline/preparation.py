@@ -36,7 +36,6 @@ from caliv_graph.products import (
     Recording,
     TargetObservation,
 )
-from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.readers.empty import CountedRecording
 from caliv_graph.readers.pose_pauses import without_pauses
 from caliv_graph.readers.without_times import without_times
@@ -54,6 +53,7 @@ from caliv_graph.trajectory.odometry import OdometryPoses
 from caliv_graph.trajectory.select import (
     VehicleTrajectory,
     are_given,
+    sharing_poses,
     smooth_trajectories,
     takes_given_poses,
 )
@@ -166,8 +166,7 @@ def prepare(
     """
     check_clouds(recordings, config)
     as_given = recordings, config
-    recordings = without_times(recordings, config)
-    recordings = [CountedRecording(with_common_stamps(recording)) for recording in recordings]
+    recordings = [CountedRecording(of) for of in as_used(recordings, config, motions)]
     recordings, pauses = _with_poses(recordings, config, motions)
     raw = raw_findings(motions, config)
     raise_fatal(raw)
@@ -226,6 +225,20 @@ def prepare(
         wrong,
         misplaced,
     )
+
+
+def as_used(
+    recordings: Sequence[Recording], config: Config, motions: Mapping[int, MotionData]
+) -> list[Recording]:
+    """The recordings as all stages see them.
+
+    Clouds that were deskewed before they were recorded have no times, and clouds that share a pose
+    have one stamp. `motions` by the recording's index.
+    """
+    return [
+        sharing_poses(recording, motions[index], config)
+        for index, recording in enumerate(without_times(recordings, config))
+    ]
 
 
 def _with_poses(

@@ -37,7 +37,7 @@ from caliv_graph.physics import (
     without_effects,
 )
 from caliv_graph.pipeline.mistakes import mistakes
-from caliv_graph.pipeline.preparation import Prepared, motions_of, prepare
+from caliv_graph.pipeline.preparation import Prepared, as_used, motions_of, prepare
 from caliv_graph.pipeline.standing import with_standing
 from caliv_graph.products import (
     Calibration,
@@ -46,7 +46,6 @@ from caliv_graph.products import (
     Recording,
 )
 from caliv_graph.readers.sampled import SampledRecording
-from caliv_graph.readers.without_times import without_times
 from caliv_graph.results.run import CalibrationRun, RunRecord
 from caliv_graph.structure.slow_errors import slow_errors
 from caliv_graph.structure.term import structure_terms
@@ -193,7 +192,7 @@ def _calibrated(
     guessed = used if prior is None else starting_from(used, prior, digests, marks)
 
     prepared = prepare(recordings, guessed, motions, progress, refused)
-    recordings = without_times(sampled, prepared.config)
+    recordings = as_used(sampled, prepared.config, motions)
     if left_out:
         prepared = prepared.without_clouds({count.lidar for count in left_out})
         notes = (*notes, *(left_out_sentence(outliers_text(count)) for count in left_out))

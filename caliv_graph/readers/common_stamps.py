@@ -1,8 +1,10 @@
-"""Stamps of LiDARs that were triggered together and differ by rounding alone.
+"""Stamps of LiDARs that are triggered together, or come to within milliseconds of each other.
 
-Drivers that keep seconds as a floating-point number are off by up to 0.2 microseconds. Two poses of
-the vehicle within a microsecond are one: as two they would be tied to each other by an IMU without
-noise, and each would have a heave of its own.
+Drivers that keep seconds as a floating-point number are off by up to 0.2 microseconds; LiDARs that
+are synchronised, by 10 to 100; and free ones pass each other. Two poses of the vehicle so near are
+one: as two they are tied to each other by an IMU that in this time has next to no noise, and each
+has a heave of its own. At 50 microseconds they are known to each other 1e8 times as well as on the
+map, more than double precision holds (`trajectory/README.md`, section 2).
 """
 
 from __future__ import annotations
@@ -12,11 +14,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from caliv_graph.conventions import NANOSECONDS_PER_SECOND
 from caliv_graph.products import IntArray, LidarScan, Recording
 from caliv_graph.readers.forwarding import ForwardingRecording
 
 MERGE_NS = 1_000
-"""Stamps that are not farther apart share a pose: at 50 m/s a vehicle moves by 0.05 mm."""
+"""Stamps that are not farther apart are the same: at 50 m/s a vehicle moves by 0.05 mm."""
+
+COMMON_NS = 5_000_000
+"""Stamps that are not farther apart share a pose where an IMU or wheels tell the motion between
+them: the times of the points count from the common stamp, and the points are moved by it, as within
+a sweep. Of given poses each cloud has its own."""
 
 
 def without_neighbours(stamps_ns: IntArray, least_ns: int) -> IntArray:
@@ -28,21 +36,28 @@ def without_neighbours(stamps_ns: IntArray, least_ns: int) -> IntArray:
     return np.array(kept, dtype=np.int64)
 
 
-def with_common_stamps(recording: Recording) -> Recording:
-    """The recording; where stamps are within `MERGE_NS`, all have the first one.
+def with_common_stamps(recording: Recording, within_ns: int = MERGE_NS) -> Recording:
+    """The recording; clouds whose stamps are within `within_ns` have the first of these stamps.
 
-    Of two clouds of one LiDAR that are so near, the first is kept.
+    The times of their points are as before. At most one cloud of each LiDAR has a stamp: of two
+    within `MERGE_NS` the first is kept, others begin a stamp of their own.
     """
-    own = {name: np.asarray(recording.scan_stamps_ns(name), np.int64) for name in recording.lidars}
-    every = np.unique(np.concatenate([*own.values(), np.zeros(0, np.int64)]))
-    common = without_neighbours(every, MERGE_NS)
-    if len(common) == len(every):
+    own = {name: recording.scan_stamps_ns(name) for name in recording.lidars}
+    events = sorted((stamp, name) for name, stamps in own.items() for stamp in stamps)
+    taken: dict[str, dict[int, int]] = {name: {} for name in own}
+    first, seen = None, set[str]()
+    for stamp, name in events:
+        if (
+            first is None
+            or stamp - first > within_ns
+            or (name in seen and stamp - first > MERGE_NS)
+        ):
+            first, seen = stamp, set()
+        if name not in seen:
+            taken[name][first] = stamp
+            seen.add(name)
+    if all(list(taken[name]) == list(stamps) for name, stamps in own.items()):
         return recording
-    taken = {}
-    for name, stamps in own.items():
-        firsts = common[np.searchsorted(common, stamps, "right") - 1]
-        _, once = np.unique(firsts, return_index=True)
-        taken[name] = dict(zip(firsts[once].tolist(), stamps[once].tolist(), strict=True))
     return _CommonStamps(recording, taken)
 
 
@@ -61,4 +76,16 @@ class _CommonStamps(ForwardingRecording):
         recorded = self.recorded_ns[lidar]
         given = {old: new for new, old in recorded.items() if wanted is None or new in wanted}
         for scan in self.recording.scans(lidar, given):
-            yield replace(scan, stamp_ns=given[scan.stamp_ns])
+            yield _restamped(scan, given[scan.stamp_ns])
+
+
+def _restamped(scan: LidarScan, stamp_ns: int) -> LidarScan:
+    """A cloud with another stamp, its points as of the same times."""
+    later_ns = scan.stamp_ns - stamp_ns
+    if later_ns <= MERGE_NS:
+        return replace(scan, stamp_ns=stamp_ns)
+    times_s = scan.point_times_s
+    if times_s is None:
+        times_s = np.zeros(len(scan.points_lidar))
+    times_s = times_s + later_ns / NANOSECONDS_PER_SECOND
+    return replace(scan, stamp_ns=stamp_ns, point_times_s=times_s)

@@ -17,6 +17,7 @@ from caliv_graph.errors import TrajectoryError
 from caliv_graph.geometry.interpolation import PoseCurve
 from caliv_graph.geometry.se3 import stack, unstack
 from caliv_graph.products import Array, IntArray, MotionData, Recording, Trajectory
+from caliv_graph.readers.common_stamps import COMMON_NS, MERGE_NS, with_common_stamps
 from caliv_graph.trajectory.given import (
     error_covariances,
     given_trajectory,
@@ -166,6 +167,16 @@ def takes_given_poses(motion: MotionData, config: Config) -> bool:
     IMU beside them.
     """
     return config.names_poses() or (motion.poses is not None and motion.imu is None)
+
+
+def sharing_poses(recording: Recording, motion: MotionData, config: Config) -> Recording:
+    """The recording with one stamp for clouds that share a pose (`with_common_stamps`).
+
+    Those are within `COMMON_NS` of each other where the trajectory is smoothed. By given poses each
+    cloud has its own, but for stamps that are the same.
+    """
+    given = takes_given_poses(motion, config)
+    return with_common_stamps(recording, MERGE_NS if given else COMMON_NS)
 
 
 def are_given(trajectories: Sequence[VehicleTrajectory]) -> bool:

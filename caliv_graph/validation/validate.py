@@ -17,9 +17,9 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
-from caliv_graph.readers.common_stamps import MERGE_NS, without_neighbours
+from caliv_graph.readers.common_stamps import COMMON_NS, without_neighbours
 from caliv_graph.trajectory.about_poses import about_poses
-from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory, sharing_poses, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation.clouds import (
     Clouds,
@@ -92,6 +92,7 @@ def validate(
             alone = about_tracked(recording, names, calibration, config, motions, progress)
             tracked, motions = alone.lidar, {0: alone.motion}
             config, calibration = alone.config, alone.calibration
+        recording = sharing_poses(recording, motions[0], config)
         extrinsics = _extrinsics(names, calibration, config)
         with progress.stage("smoothing the trajectory", None):
             (rough,) = smooth_trajectories([recording], config, [[]], motions, by_walls=True)
@@ -235,7 +236,7 @@ def _nodes(
     """Times of the scans, ascending; times that share a node appear once."""
     taken = [extrinsics.true_ns(name, stamps) for name, stamps in chosen.items()]
     stamps = np.unique(np.clip(np.concatenate([*taken, np.zeros(0, dtype=np.int64)]), *span_ns))
-    return without_neighbours(stamps, 2 * MERGE_NS)
+    return without_neighbours(stamps, COMMON_NS)
 
 
 def _measured(

@@ -17,13 +17,12 @@ from caliv_graph.errors import SolveError
 from caliv_graph.geometry.se3 import unstack
 from caliv_graph.planning.recorded_walls import RecordedWalls
 from caliv_graph.products import Recording
-from caliv_graph.readers.common_stamps import with_common_stamps
 from caliv_graph.structure.noise import range_sigmas
 from caliv_graph.structure.own_body import without_own_body
 from caliv_graph.structure.read import level, read_patches
 from caliv_graph.structure.solve import solve_structure
 from caliv_graph.structure.term import aligned_start, problem_of, usable
-from caliv_graph.trajectory.select import VehicleTrajectory, smooth_trajectories
+from caliv_graph.trajectory.select import VehicleTrajectory, sharing_poses, smooth_trajectories
 
 
 @dataclass(frozen=True)
@@ -68,13 +67,14 @@ def solved_walls(
     """
     if not uses_walls(config):
         return None
-    recording = with_common_stamps(recording)
+    motions = {0: recording.motion()}
+    recording = sharing_poses(recording, motions[0], config)
     (patches,) = read_patches([recording], [rough], config, progress, keep_level=True)
     patches, _ = without_own_body(patches, rough, config)
     if not len(patches.scan):
         return None
     with progress.stage("joining the walls", None):
-        stamps, motions = np.unique(patches.stamps_ns), {0: recording.motion()}
+        stamps = np.unique(patches.stamps_ns)
         (trajectory,) = smooth_trajectories([recording], config, [stamps], motions, [rough])
         heave_m = usual_noise(config.noise).heave_m
         noise = first_pose_noise(config.noise)

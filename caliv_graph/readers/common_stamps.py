@@ -4,7 +4,7 @@ Drivers that keep seconds as a floating-point number are off by up to 0.2 micros
 are synchronised, by 10 to 100; and free ones pass each other. Two poses of the vehicle so near are
 one: as two they are tied to each other by an IMU that in this time has next to no noise, and each
 has a heave of its own. At 50 microseconds they are known to each other 1e8 times as well as on the
-map, more than double precision holds (`trajectory/README.md`, section 2).
+map, more than double precision holds (`trajectory/README.md`, section 1).
 """
 
 from __future__ import annotations

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
 
-from caliv_graph.calibration.motion_suspects import motion_scores
+from caliv_graph.calibration.motion_suspects import motion_parts, motion_scores
 from caliv_graph.calibration.suspect_values import motion_suspects
 from caliv_graph.config.model import Config
 from caliv_graph.products import MotionData, Suspect
 from caliv_graph.trajectory.smooth import smooth_trajectory
+from caliv_graph.trajectory.smoothed import JointInformation, SmoothedTrajectory
 from caliv_graph.uncertainty.suspects import ranking
 from caliv_graph.wording.suspects import motion_sentence
 from tests.trajectory.motions import Course, config_for, eight_drive, mounted_askew, record, stamps
@@ -50,6 +52,28 @@ def too_fast(motion: MotionData) -> MotionData:
     assert motion.twist is not None
     twist = replace(motion.twist, velocity=1.2 * motion.twist.velocity)
     return replace(motion, twist=twist)
+
+
+def test_poses_that_rounding_makes_indefinite_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scans 0.5 ms apart on a map whose height nothing tells: 1e12 beside 5 per square metre."""
+    motion = replace(drive(), gnss=None)
+    close = np.sort(np.concatenate([WANTED, WANTED[::3] + 500_000]))
+    smoothed = smooth_trajectory(motion, CONFIG, close)
+    joint = SmoothedTrajectory.joint
+
+    def rounded(*args: Any) -> JointInformation:
+        found = joint(*args)
+        information = found.information.copy()
+        heights = 6 * np.arange(len(close)) + 5
+        information[heights, heights] *= 1.0 - 2e-11
+        of_poses = information[: 6 * len(close), : 6 * len(close)]
+        assert np.linalg.eigvalsh(of_poses)[0] < 0.0
+        return replace(found, information=information)
+
+    monkeypatch.setattr(SmoothedTrajectory, "joint", rounded)
+    _, parts = motion_parts({0: smoothed}, {0: close})
+
+    assert np.isfinite(parts[0].own).all()
 
 
 def test_wheels_without_an_imu_have_suspects_whose_clocks_are_estimated() -> None:

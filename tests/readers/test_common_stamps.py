@@ -4,9 +4,10 @@ from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
 from caliv_graph.products import LidarScan
-from caliv_graph.readers.common_stamps import with_common_stamps, without_neighbours
+from caliv_graph.readers.common_stamps import COMMON_NS, with_common_stamps, without_neighbours
 from caliv_graph.readers.forwarding import ForwardingRecording
 
 T = 1_750_000_000_123_456_789
@@ -17,6 +18,7 @@ class Stamped(ForwardingRecording):
     """Clouds that hold nothing but the time at which they were taken."""
 
     stamps: dict[str, list[int]]
+    swept: tuple[str, ...] = ()
 
     @property
     def lidars(self) -> tuple[str, ...]:
@@ -28,7 +30,8 @@ class Stamped(ForwardingRecording):
     def scans(self, lidar: str, wanted: Container[int] | None = None) -> Iterator[LidarScan]:
         for stamp in self.stamps[lidar]:
             if wanted is None or stamp in wanted:
-                yield LidarScan(lidar, stamp, np.zeros((1, 3)), source=str(stamp))
+                times = np.array([0.0, 0.1]) if lidar in self.swept else None
+                yield LidarScan(lidar, stamp, np.zeros((2, 3)), str(stamp), times)
 
 
 def recorded(**stamps: list[int]) -> Stamped:
@@ -68,6 +71,29 @@ def test_of_two_clouds_of_one_lidar_the_first_is_kept() -> None:
 
     assert list(common.scan_stamps_ns("a")) == [T, T + 5_000]
     assert [scan.source for scan in common.scans("a")] == [str(T), str(T + 5_000)]
+
+
+def test_points_keep_their_times_where_stamps_are_milliseconds_apart() -> None:
+    stamps = {"top": [T], "left": [T + 50_000], "right": [T + 2_000_000], "far": [T + 5_000_001]}
+    drive = Stamped(None, stamps, swept=("left",))  # type: ignore[arg-type]
+
+    common = with_common_stamps(drive, COMMON_NS)
+
+    of = {name: next(iter(common.scans(name))) for name in stamps}
+    assert [of[name].stamp_ns - T for name in stamps] == [0, 0, 0, 5_000_001]
+    assert of["top"].point_times_s is None
+    assert of["left"].point_times_s == pytest.approx([0.00005, 0.10005])
+    # No times: all points are as of the stamp, which was 2 ms later.
+    assert of["right"].point_times_s == pytest.approx([0.002, 0.002])
+
+
+def test_clouds_of_one_lidar_stay_apart_however_many_it_takes() -> None:
+    drive = recorded(fast=[T, T + 2_000_000, T + 4_000_000], slow=[T + 3_000_000])
+
+    common = with_common_stamps(drive, COMMON_NS)
+
+    assert list(common.scan_stamps_ns("fast")) == [T, T + 2_000_000, T + 4_000_000]
+    assert list(common.scan_stamps_ns("slow")) == [T + 2_000_000]
 
 
 def test_distances_are_to_what_is_kept() -> None:

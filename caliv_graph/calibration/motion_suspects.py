@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+import scipy.linalg
 
 from caliv_graph.errors import SolveError, TrajectoryError
 from caliv_graph.products import Array, IntArray
@@ -95,6 +96,25 @@ def worst_misfit(trajectories: Sequence[VehicleTrajectory]) -> float:
     return max([1.0, *map(misfit, smoothed)])
 
 
+def _solved(information: Array, right: Array) -> Array:
+    """information^-1 right; under a ridge where rounding made it indefinite.
+
+    Scans of two LiDARs may be milliseconds apart, and their heights known to each other to a
+    micrometre, on a map whose own height nothing tells.
+
+    Raises:
+        TrajectoryError: it is singular.
+    """
+    try:
+        return np.asarray(scipy.linalg.cho_solve(scipy.linalg.cho_factor(information), right))
+    except scipy.linalg.LinAlgError:
+        pass
+    try:
+        return solved(factor_of(information), right)
+    except SolveError:
+        raise TrajectoryError("the motion data leave the vehicle's poses undetermined") from None
+
+
 def _part(
     smoothed: SmoothedTrajectory,
     suspects: Sequence[SuspectParameter],
@@ -108,15 +128,9 @@ def _part(
     at = np.concatenate([where[s.parameter.name] for s in suspects])
     offset = np.concatenate([s.offset for s in suspects])
     of_poses = joint.information[:split, :split]
-    try:
-        # Scans of two LiDARs may be 2 ms apart, and their heights known to each other to a
-        # micrometre, on a map whose own height nothing tells: rounding makes that indefinite.
-        factor = factor_of(of_poses)
-    except SolveError:
-        raise TrajectoryError("the motion data leave the vehicle's poses undetermined") from None
     cross = joint.information[:split, split:]
-    follow = -solved(factor, cross)
-    shift = solved(factor, joint.gradient[:split])
+    both = _solved(of_poses, np.column_stack([cross, joint.gradient[:split]]))
+    follow, shift = -both[:, :-1], both[:, -1]
     own = joint.information[split:, split:] + cross.T @ follow
     gradient = joint.gradient[split:] - cross.T @ shift
     # From the estimate's parameters to those that the user typed.

@@ -358,9 +358,7 @@ def _deskewed(
     if not told:
         return frozenset(), ""
     # A LiDAR without times has none to leave out.
-    swept = {
-        of.lidars[k] for of in patches for k in np.unique(of.scan_lidar[of.scan[of.time_s != 0]])
-    }
+    swept = {of.lidars[k] for of in patches for k in np.unique(of.scan_lidar[of.swept_scans])}
     measured = any(of.measured for of in left.values())
     measured |= any(lidar.deskewed is False for lidar in config.lidars.values())
     silent = (

@@ -36,26 +36,40 @@ def without_neighbours(stamps_ns: IntArray, least_ns: int) -> IntArray:
     return np.array(kept, dtype=np.int64)
 
 
-def with_common_stamps(recording: Recording, within_ns: int = MERGE_NS) -> Recording:
+def nearest(stamps_ns: IntArray, to_ns: IntArray) -> IntArray:
+    """(m,) index of the nearest of some stamps (n,), ascending, to each of others (m,)."""
+    right = np.clip(np.searchsorted(stamps_ns, to_ns), 0, len(stamps_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    left_nearer = np.abs(to_ns - stamps_ns[left]) <= np.abs(stamps_ns[right] - to_ns)
+    return np.asarray(np.where(left_nearer, left, right), np.int64)
+
+
+def moved_to_neighbours(stamps_ns: IntArray, others_ns: IntArray, within_ns: int) -> IntArray:
+    """Stamps (k,), ascending: (n,) of which those within `within_ns` of others are these others."""
+    if not len(others_ns):
+        return stamps_ns
+    found = others_ns[nearest(others_ns, stamps_ns)]
+    return np.unique(np.where(np.abs(found - stamps_ns) <= within_ns, found, stamps_ns))
+
+
+def with_common_stamps(recording: Recording, within_ns: int) -> Recording:
     """The recording; clouds whose stamps are within `within_ns` have the first of these stamps.
 
     The times of their points are as before. At most one cloud of each LiDAR has a stamp: of two
-    within `MERGE_NS` the first is kept, others begin a stamp of their own.
+    within `MERGE_NS` of each other the first is kept, others begin a stamp of their own.
     """
     own = {name: recording.scan_stamps_ns(name) for name in recording.lidars}
     events = sorted((stamp, name) for name, stamps in own.items() for stamp in stamps)
     taken: dict[str, dict[int, int]] = {name: {} for name in own}
-    first, seen = None, set[str]()
+    first: int | None = None
+    seen, last = set[str](), dict[str, int]()
     for stamp, name in events:
-        if (
-            first is None
-            or stamp - first > within_ns
-            or (name in seen and stamp - first > MERGE_NS)
-        ):
+        if name in last and stamp - last[name] <= MERGE_NS:
+            continue
+        if first is None or stamp - first > within_ns or name in seen:
             first, seen = stamp, set()
-        if name not in seen:
-            taken[name][first] = stamp
-            seen.add(name)
+        taken[name][first] = last[name] = stamp
+        seen.add(name)
     if all(list(taken[name]) == list(stamps) for name, stamps in own.items()):
         return recording
     return _CommonStamps(recording, taken)

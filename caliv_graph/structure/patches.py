@@ -122,6 +122,19 @@ class DrivePatches:
     noise: Mapping[int, RangeNoise] = field(default_factory=dict)
     without_rows: frozenset[int] = frozenset()
 
+    @cached_property
+    def swept_scans(self) -> BoolArray:
+        """(M,) whether patches of a scan differ in time.
+
+        Those of a cloud without times have one, which is not zero where it has the stamp of another
+        cloud.
+        """
+        first = np.full(len(self.stamps_ns), np.inf)
+        np.minimum.at(first, self.scan, self.time_s)
+        last = np.full(len(self.stamps_ns), -np.inf)
+        np.maximum.at(last, self.scan, self.time_s)
+        return np.asarray(last > first)
+
     def part(self, keep: BoolArray) -> DrivePatches:
         """Some of the patches (N,), of the same scans."""
         return replace(

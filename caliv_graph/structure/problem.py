@@ -97,8 +97,11 @@ def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Ar
     own = np.clip(stamps + np.round(1e9 * patches.time_s).astype(np.int64), begin, end)
     # Thousands of patches share a time to a tenth of a millisecond. Rounded, not cut off: a time
     # that is too early by the mean shifts all LiDARs along the motion.
-    times, inverse = np.unique((own + SAME_TIME_NS // 2) // SAME_TIME_NS, return_inverse=True)
-    R, t = trajectory.poses_at(np.clip(times * SAME_TIME_NS, begin, end))
+    # Not of a cloud without a sweep, in which nothing is left of the rounding but its error.
+    rounded = (own + SAME_TIME_NS // 2) // SAME_TIME_NS * SAME_TIME_NS
+    own = np.where(patches.swept_scans[patches.scan], rounded, own)
+    times, inverse = np.unique(own, return_inverse=True)
+    R, t = trajectory.poses_at(np.clip(times, begin, end))
     R, t = R[inverse.ravel()], t[inverse.ravel()]
     R_s, t_s = trajectory.poses_at(patches.stamps_ns)
     R_s, t_s = R_s[patches.scan], t_s[patches.scan]

@@ -64,7 +64,8 @@ alone where they do."""
 
 LAST_STEPS = 5
 STEPS = (2, LAST_STEPS)
-"""Steps at most in each of the rounds with all scans, and after stamps were found to jitter."""
+"""Steps in each of the rounds with all scans, and after stamps were found to jitter: at most, but
+for wild ones."""
 
 SMALL_SIGMAS = 0.02
 """Step in standard deviations of the extrinsics at which the solve has converged."""
@@ -544,9 +545,9 @@ def _settled(
 def _step(held: list[Sighted], systems: list[System], tilts: bool) -> tuple[float, float]:
     """Puts the estimate after a step in the place of the one in `held`.
 
-    Returns the size of the step in sigmas of the extrinsics, and by how many metres it moves the
-    patches of some LiDAR, those of median range. The system is taken out of `systems`, where it is
-    there.
+    Returns the size of the step in sigmas of the extrinsics, and by how many metres some extrinsic
+    moves the LiDAR's patches of median range, the vehicle held. The system is taken out of
+    `systems`, where it is there.
     """
     found = without_residuals(held[0])
     problem, layout, sightings = found.problem, found.layout, found.sightings

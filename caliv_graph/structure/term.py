@@ -217,7 +217,7 @@ def problem_of(
     stamps = prior.stamps_ns.tolist()
     pose_of_scan = np.searchsorted(prior.stamps_ns, patches.stamps_ns)
     # An odometry is made of the same scans: its rates have no error apart from them.
-    if patches.time_s.any() and odometry_of([trajectory]) is None:
+    if patches.swept_scans.any() and odometry_of([trajectory]) is None:
         prior = prior.with_rates()
     guesses = {name: configured_guess(config, name) for name in patches.lidars}
     placed = np.repeat([PLACED_RAD, PLACED_M], 3)

@@ -23,7 +23,7 @@ def turn_sigmas(
     patches: DrivePatches, pose_of_scan: IntArray, trajectory: VehicleTrajectory
 ) -> Array:
     """(P, 3) rad/s, vehicle axes, for the P poses with a scan; empty where nothing sweeps."""
-    if not patches.time_s.any() or not isinstance(trajectory, SmoothedTrajectory):
+    if not patches.swept_scans.any() or not isinstance(trajectory, SmoothedTrajectory):
         return np.zeros((0, 3))
     poses, number = np.unique(pose_of_scan, return_inverse=True)
     longest = np.full(len(poses), LEAST_S)

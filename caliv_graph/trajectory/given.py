@@ -83,7 +83,8 @@ class SlowStated:
     """What the messages of poses state, where that is mostly a slow error; 1 sigma per axis.
 
     Attributes:
-        stated: of rotation (rad) and of position (m), the median over the poses.
+        stated: of rotation (rad) and of position (m), the median over poses and axes: an axis that
+            is not observed often has a variance of 1e6.
         scatter: what they scatter by at most (`scatter_of_poses`).
     """
 
@@ -113,7 +114,7 @@ def slow_errors_stated(trajectory: Trajectory) -> SlowStated | None:
     if not len(known) or scatter is None:
         return None
     variances = np.median(np.diagonal(known, axis1=1, axis2=2), axis=0)
-    said = float(np.sqrt(variances[:3].mean())), float(np.sqrt(variances[3:].mean()))
+    said = float(np.sqrt(np.median(variances[:3]))), float(np.sqrt(np.median(variances[3:])))
     found = SlowStated(said, scatter)
     return None if found.slow == (None, None) else found
 

@@ -17,9 +17,19 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
-from caliv_graph.readers.common_stamps import COMMON_NS, without_neighbours
+from caliv_graph.readers.common_stamps import (
+    COMMON_NS,
+    MERGE_NS,
+    moved_to_neighbours,
+    without_neighbours,
+)
 from caliv_graph.trajectory.about_poses import about_poses
-from caliv_graph.trajectory.select import VehicleTrajectory, sharing_poses, smooth_trajectories
+from caliv_graph.trajectory.select import (
+    GivenTrajectory,
+    VehicleTrajectory,
+    sharing_poses,
+    smooth_trajectories,
+)
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from caliv_graph.validation.clouds import (
     Clouds,
@@ -156,9 +166,14 @@ def _way(
     rough, by_walls = smoothed
     names = extrinsics.T_vehicle_lidar
     chosen = {name: choose_scans(recording.scan_stamps_ns(name), rough) for name in names}
-    nodes = _nodes(chosen, extrinsics, rough.span_ns)
+    least_ns = 2 * MERGE_NS if isinstance(rough, GivenTrajectory) else COMMON_NS
+    nodes = _nodes(chosen, extrinsics, rough.span_ns, least_ns)
     with progress.stage("smoothing the trajectory at the scans", None):
-        wanted = nodes if by_walls is None else np.union1d(nodes, by_walls.trajectory.stamps_ns)
+        wanted = nodes
+        if by_walls is not None:
+            # An estimated time offset moves the one and not the other.
+            nodes = moved_to_neighbours(nodes, by_walls.trajectory.stamps_ns, COMMON_NS)
+            wanted = np.union1d(nodes, by_walls.trajectory.stamps_ns)
         (trajectory,) = smooth_trajectories(
             [recording], config, [wanted], motions, [rough], by_walls=by_walls is not None
         )
@@ -231,12 +246,15 @@ def _is_found(config: Config, name: str) -> bool:
 
 
 def _nodes(
-    chosen: Mapping[str, IntArray], extrinsics: Extrinsics, span_ns: tuple[int, int]
+    chosen: Mapping[str, IntArray],
+    extrinsics: Extrinsics,
+    span_ns: tuple[int, int],
+    least_ns: int,
 ) -> IntArray:
-    """Times of the scans, ascending; times that share a node appear once."""
+    """Times of the scans, ascending; times that share a node, within `least_ns`, appear once."""
     taken = [extrinsics.true_ns(name, stamps) for name, stamps in chosen.items()]
     stamps = np.unique(np.clip(np.concatenate([*taken, np.zeros(0, dtype=np.int64)]), *span_ns))
-    return without_neighbours(stamps, COMMON_NS)
+    return without_neighbours(stamps, least_ns)
 
 
 def _measured(

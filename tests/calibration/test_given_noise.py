@@ -125,9 +125,12 @@ def test_slow_errors_that_messages_state_stand_where_the_drive_tells_little() ->
 
     assert by(vague, stating) == pytest.approx(0.015, rel=0.3)
     assert by(vague, circle()) < 0.008
-    # What it states, five times too much, against 48 poses that say otherwise.
-    wrong = replace(circle(), slow_stated=(None, 0.075))
+    # What it states, 20 times too much, against 48 poses that say otherwise.
+    wrong = replace(circle(), slow_stated=(None, 0.3))
     assert by(told(1, TRUE), wrong) < 0.025
+    # A placeholder is no statement.
+    unknown = replace(circle(), slow_stated=(None, 500.0))
+    assert by(told(1, TRUE), unknown) == by(told(1, TRUE), circle())
 
 
 def test_slow_errors_are_of_the_drives_that_state_some() -> None:

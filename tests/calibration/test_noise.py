@@ -256,6 +256,21 @@ def test_clouds_that_are_not_sound_have_no_say() -> None:
     assert scale > 1.5 * before[1] or white_m(spoilt) > 1.5 * white_m(before[0])
 
 
+def test_slow_errors_that_messages_state_count_where_clouds_tell_little() -> None:
+    case = make_case(count=24)
+    problem = with_poses(case, given_poses(case, BOTH, 3))
+    vague = np.tile(np.diag([100.0] * 3 + [1.0] * 3), (problem.clouds, 1, 1))
+
+    def drift(stated_m: float | None) -> float:
+        asked = replace(problem, slow_stated=(None, stated_m))
+        every, values = np.ones(problem.clouds, np.bool_), with_given_poses(problem, case.truth)
+        noise, _ = fit_pose_noise(asked, noisy(case, 4), vague, every, values, NoiseConfig())
+        return noise.drift_position_m
+
+    assert drift(0.012) == pytest.approx(0.012, rel=0.3)
+    assert drift(None) == pytest.approx(0.003, rel=0.3)
+
+
 def test_wrong_mountings_are_not_taken_for_noise() -> None:
     # Extrinsics and targets are integrated out: 5 mrad and 20 mm of them change nothing much.
     case = make_case(count=32, seed=5)

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from caliv_graph.products import LidarScan
-from caliv_graph.readers.common_stamps import COMMON_NS, with_common_stamps, without_neighbours
+from caliv_graph.readers.common_stamps import (
+    COMMON_NS,
+    MERGE_NS,
+    moved_to_neighbours,
+    nearest,
+    with_common_stamps,
+    without_neighbours,
+)
 from caliv_graph.readers.forwarding import ForwardingRecording
 
 T = 1_750_000_000_123_456_789
@@ -41,7 +48,7 @@ def recorded(**stamps: list[int]) -> Stamped:
 def test_clouds_within_a_microsecond_have_one_stamp() -> None:
     drive = recorded(front=[T, T + 100_000_238, T + 200_000_000], rear=[T + 999, T + 100_000_000])
 
-    common = with_common_stamps(drive)
+    common = with_common_stamps(drive, MERGE_NS)
 
     assert list(common.scan_stamps_ns("front")) == [T, T + 100_000_000, T + 200_000_000]
     assert list(common.scan_stamps_ns("rear")) == [T, T + 100_000_000]
@@ -53,21 +60,21 @@ def test_clouds_within_a_microsecond_have_one_stamp() -> None:
 def test_what_is_farther_apart_stays() -> None:
     drive = recorded(front=[T, T + 100_000_000], rear=[T + 1_001])
 
-    assert with_common_stamps(drive) is drive
+    assert with_common_stamps(drive, MERGE_NS) is drive
 
 
 def test_stamps_do_not_drift_along_a_chain() -> None:
     """Each is near the one before it, but not near the first."""
     drive = recorded(a=[T], b=[T + 700], c=[T + 1_400], d=[T + 2_100])
 
-    common = with_common_stamps(drive)
+    common = with_common_stamps(drive, MERGE_NS)
 
     given = [common.scan_stamps_ns(name)[0] - T for name in "abcd"]
     assert given == [0, 0, 1_400, 1_400]
 
 
 def test_of_two_clouds_of_one_lidar_the_first_is_kept() -> None:
-    common = with_common_stamps(recorded(a=[T, T + 10, T + 5_000], b=[T + 5_001]))
+    common = with_common_stamps(recorded(a=[T, T + 10, T + 5_000], b=[T + 5_001]), MERGE_NS)
 
     assert list(common.scan_stamps_ns("a")) == [T, T + 5_000]
     assert [scan.source for scan in common.scans("a")] == [str(T), str(T + 5_000)]
@@ -94,6 +101,23 @@ def test_clouds_of_one_lidar_stay_apart_however_many_it_takes() -> None:
 
     assert list(common.scan_stamps_ns("fast")) == [T, T + 2_000_000, T + 4_000_000]
     assert list(common.scan_stamps_ns("slow")) == [T + 2_000_000]
+
+
+def test_a_cloud_that_comes_twice_is_kept_once_wherever_its_group_begins() -> None:
+    drive = recorded(a=[T + 3_000_000, T + 3_000_500], b=[T])
+
+    common = with_common_stamps(drive, COMMON_NS)
+
+    assert list(common.scan_stamps_ns("a")) == [T]
+    assert [scan.source for scan in common.scans("a")] == [str(T + 3_000_000)]
+
+
+def test_stamps_move_to_their_neighbours() -> None:
+    moved = moved_to_neighbours(np.array([0, 90, 200, 310]), np.array([100, 300]), 20)
+
+    assert moved.tolist() == [0, 100, 200, 300]
+    assert moved_to_neighbours(np.array([0, 90]), np.array([], np.int64), 20).tolist() == [0, 90]
+    assert nearest(np.array([10]), np.array([0, 90])).tolist() == [0, 0]
 
 
 def test_distances_are_to_what_is_kept() -> None:

@@ -25,6 +25,20 @@ TURN_RAD_S = 5e-3
 NOISE = Noise(range_m=0.005, sighting_m=1e-4, bump_m=0.0, bias_m=0.0)
 
 
+def test_a_cloud_without_times_does_not_sweep_whatever_stamp_it_has() -> None:
+    """Where it shares that of another, all its points are as late."""
+    patches = problem_of(yard(), figure_eight(POSES), 1, NOISE).patches
+    front = patches.scan_lidar[patches.scan] == 0
+    still = replace(patches, time_s=np.where(front, 0.002, 0.0))
+    some = still.time_s + np.where(front & (patches.scan == patches.scan[front][0]), 1e-3, 0.0)
+    some[np.flatnonzero(front)[0]] = 0.0
+
+    assert not still.swept_scans.any()
+    assert np.flatnonzero(replace(still, time_s=some).swept_scans).tolist() == [
+        patches.scan[front][0]
+    ]
+
+
 @pytest.fixture(scope="module")
 def swept() -> Problem:
     """Poses err, and their rates with them."""

@@ -458,6 +458,19 @@ def test_no_strips_are_cut_in_the_middle_of_a_wild_step(
     assert not found.converged
 
 
+def test_rounds_go_on_while_steps_are_wild_in_their_gates(monkeypatch: pytest.MonkeyPatch) -> None:
+    settled, tame_m = solving._settled, list[float]()
+
+    def noted(*args: Any, **named: Any) -> solving.Sighted:
+        tame_m.append(named.get("tame_m", np.inf))
+        return settled(*args, **named)
+
+    monkeypatch.setattr(solving, "_settled", noted)
+    solve(problem_of(yard(), figure_eight(8), 1))
+
+    assert tame_m[:5] == pytest.approx([0.15, 0.075, 0.04, 0.03, 0.03])
+
+
 def test_a_step_says_by_how_much_it_moves_patches(solved: Solved) -> None:
     """10 mrad at the median range of 10 to 20 m, back to where the LiDAR was."""
     found, turned = solving.without_residuals(solved), gtsam.Pose3(gtsam.Rot3.Rz(0.01), [0, 0, 0])

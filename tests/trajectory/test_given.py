@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -106,6 +107,17 @@ def test_a_rotation_that_scatters_as_it_is_stated_tells_no_slow_error() -> None:
     turn, place = found.slow_stated
     assert turn is None
     assert place == pytest.approx(0.02)
+
+
+def test_an_axis_that_nobody_observes_is_no_slow_error() -> None:
+    motion = localised((3e-4, 3e-3), (2e-3, 0.02), (2e-3, 0.02))
+    assert motion.poses is not None
+    assert motion.poses.cov is not None
+    cov = motion.poses.cov.copy()
+    cov[:, 0, 0] = cov[:, 5, 5] = 1e6
+    found = as_used(replace(motion, poses=replace(motion.poses, cov=cov)))
+
+    assert found.slow_stated == pytest.approx((2e-3, 0.02))
 
 
 def test_rare_poses_keep_what_they_state() -> None:

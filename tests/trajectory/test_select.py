@@ -11,7 +11,7 @@ import pytest
 
 from caliv_graph.errors import TrajectoryError
 from caliv_graph.products import GivenPoses, LidarScan, MotionData
-from caliv_graph.trajectory.select import GivenTrajectory, smooth_trajectories
+from caliv_graph.trajectory.select import GivenTrajectory, sharing_poses, smooth_trajectories
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.motions import (
     START_NS,
@@ -100,6 +100,16 @@ def test_given_poses_beside_raw_sensors_are_taken_if_asked_for() -> None:
         (taken,) = smooth_trajectories([drive], config_for(Sensors(), **asked))
         assert isinstance(taken, GivenTrajectory)
         assert taken.poses_at([START_NS + 10**9])[1] == pytest.approx(np.array([[2.0, 0.0, 0.0]]))
+
+
+def test_clouds_share_a_pose_where_motion_data_tell_what_is_between() -> None:
+    later = START_NS + 3_000_000
+    smoothed = Drive(record(Course(arc_drive(5.0)), Sensors(), 0), (START_NS,), (later,))
+    taken = Drive(given(), (START_NS,), (later,))
+
+    for drive, stamp in ((smoothed, START_NS), (taken, later)):
+        shared = sharing_poses(drive, drive.motion(), config_for(Sensors()))
+        assert list(shared.scan_stamps_ns("rear")) == [stamp]
 
 
 def test_between_given_poses_the_vehicle_moves_evenly() -> None:

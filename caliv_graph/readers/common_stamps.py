@@ -36,22 +36,6 @@ def without_neighbours(stamps_ns: IntArray, least_ns: int) -> IntArray:
     return np.array(kept, dtype=np.int64)
 
 
-def nearest(stamps_ns: IntArray, to_ns: IntArray) -> IntArray:
-    """(m,) index of the nearest of some stamps (n,), ascending, to each of others (m,)."""
-    right = np.clip(np.searchsorted(stamps_ns, to_ns), 0, len(stamps_ns) - 1)
-    left = np.maximum(right - 1, 0)
-    left_nearer = np.abs(to_ns - stamps_ns[left]) <= np.abs(stamps_ns[right] - to_ns)
-    return np.asarray(np.where(left_nearer, left, right), np.int64)
-
-
-def moved_to_neighbours(stamps_ns: IntArray, others_ns: IntArray, within_ns: int) -> IntArray:
-    """Stamps (k,), ascending: (n,) of which those within `within_ns` of others are these others."""
-    if not len(others_ns):
-        return stamps_ns
-    found = others_ns[nearest(others_ns, stamps_ns)]
-    return np.unique(np.where(np.abs(found - stamps_ns) <= within_ns, found, stamps_ns))
-
-
 def with_common_stamps(recording: Recording, within_ns: int) -> Recording:
     """The recording; clouds whose stamps are within `within_ns` have the first of these stamps.
 

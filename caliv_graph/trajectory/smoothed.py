@@ -27,6 +27,7 @@ from caliv_graph.trajectory.imu import (
 )
 from caliv_graph.trajectory.inputs import SmootherInput
 from caliv_graph.trajectory.marginals import Marginals, node_ordering
+from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.parameters import InputParameter, UncertainParameter, sigmas_in
 from caliv_graph.trajectory.solve import LONE_YAW_SIGMA_RAD
 from caliv_graph.trajectory.states import States, poses_of_vehicle, without_bias
@@ -329,15 +330,13 @@ class SmoothedTrajectory:
             KeyError: a stamp has no node.
         """
         stamps = np.asarray(stamps_ns, dtype=np.int64)
-        right = np.clip(np.searchsorted(self.nodes_ns, stamps), 1, len(self.nodes_ns) - 1)
-        left_nearer = stamps - self.nodes_ns[right - 1] < self.nodes_ns[right] - stamps
-        i = right - left_nearer
+        i = nearest_node(self.nodes_ns, stamps)
         missing = np.abs(self.nodes_ns[i] - stamps) > MERGE_NS
         if missing.any():
             raise KeyError(int(stamps[np.argmax(missing)]))
         if (np.diff(i) <= 0).any():
             raise ValueError("stamps must increase, with a node for each")
-        return np.asarray(i, dtype=np.int64)
+        return i
 
     def joint_information(
         self, stamps_ns: Sequence[int] | IntArray

@@ -10,7 +10,7 @@ from caliv_graph.calibration.noise import first_pose_noise
 from caliv_graph.config.model import Config
 from caliv_graph.geometry.se3 import joint_right_to_vehicle_axes
 from caliv_graph.products import Array, Calibration, IntArray, PoseNoise
-from caliv_graph.readers.common_stamps import nearest
+from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.select import VehicleTrajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 
@@ -43,7 +43,7 @@ def pose_covariance(
     Returns:
         (6 S, 6 S) right perturbations.
     """
-    at = nearest(nodes_ns, taken_ns)
+    at = nearest_node(nodes_ns, taken_ns)
     if isinstance(trajectory, SmoothedTrajectory):
         information, _ = trajectory.joint_information(nodes_ns)
         cov = np.asarray(np.linalg.inv(information), dtype=np.float64)

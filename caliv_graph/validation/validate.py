@@ -17,13 +17,9 @@ from caliv_graph.config.model import Config
 from caliv_graph.errors import ConfigError
 from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.products import Calibration, IntArray, MotionData, Recording
-from caliv_graph.readers.common_stamps import (
-    COMMON_NS,
-    MERGE_NS,
-    moved_to_neighbours,
-    without_neighbours,
-)
+from caliv_graph.readers.common_stamps import COMMON_NS, MERGE_NS, without_neighbours
 from caliv_graph.trajectory.about_poses import about_poses
+from caliv_graph.trajectory.measurements import nearest_node
 from caliv_graph.trajectory.select import (
     GivenTrajectory,
     VehicleTrajectory,
@@ -243,6 +239,14 @@ def _with_guesses(names: Sequence[str], calibration: Calibration, config: Config
 def _is_found(config: Config, name: str) -> bool:
     """Whether nobody gave a guess of a LiDAR."""
     return isinstance(config.lidars[name], FoundLidarConfig)
+
+
+def moved_to_neighbours(stamps_ns: IntArray, others_ns: IntArray, within_ns: int) -> IntArray:
+    """Stamps (k,), ascending: (n,) of which those within `within_ns` of others are these others."""
+    if not len(others_ns):
+        return stamps_ns
+    found = others_ns[nearest_node(others_ns, stamps_ns)]
+    return np.unique(np.where(np.abs(found - stamps_ns) <= within_ns, found, stamps_ns))
 
 
 def _nodes(

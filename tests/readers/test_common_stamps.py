@@ -10,8 +10,6 @@ from caliv_graph.products import LidarScan
 from caliv_graph.readers.common_stamps import (
     COMMON_NS,
     MERGE_NS,
-    moved_to_neighbours,
-    nearest,
     with_common_stamps,
     without_neighbours,
 )
@@ -110,14 +108,6 @@ def test_a_cloud_that_comes_twice_is_kept_once_wherever_its_group_begins() -> No
 
     assert list(common.scan_stamps_ns("a")) == [T]
     assert [scan.source for scan in common.scans("a")] == [str(T + 3_000_000)]
-
-
-def test_stamps_move_to_their_neighbours() -> None:
-    moved = moved_to_neighbours(np.array([0, 90, 200, 310]), np.array([100, 300]), 20)
-
-    assert moved.tolist() == [0, 100, 200, 300]
-    assert moved_to_neighbours(np.array([0, 90]), np.array([], np.int64), 20).tolist() == [0, 90]
-    assert nearest(np.array([10]), np.array([0, 90])).tolist() == [0, 0]
 
 
 def test_distances_are_to_what_is_kept() -> None:

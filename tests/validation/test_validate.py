@@ -14,7 +14,7 @@ from caliv_graph.validation.covariances import given_pose_covariance
 from caliv_graph.validation.findings import AFTER, BEFORE, BEST, Validation, Verdict
 from caliv_graph.validation.measure import Errors
 from caliv_graph.validation.surfaces import Pole, Wall
-from caliv_graph.validation.validate import validate
+from caliv_graph.validation.validate import moved_to_neighbours, validate
 from caliv_graph.validation.verdict import is_irregular, judge
 from tests.drives_with_chair import Memory
 from tests.validation.scenes import (
@@ -54,6 +54,13 @@ def right() -> Validation:
 @pytest.fixture(scope="module")
 def wrong() -> Validation:
     return validated(calibration_of(WRONG))
+
+
+def test_stamps_move_to_their_neighbours() -> None:
+    moved = moved_to_neighbours(np.array([0, 90, 200, 310]), np.array([100, 300]), 20)
+
+    assert moved.tolist() == [0, 100, 200, 300]
+    assert moved_to_neighbours(np.array([0, 90]), np.array([], np.int64), 20).tolist() == [0, 90]
 
 
 def test_what_stands_around_is_found(right: Validation) -> None:

@@ -123,6 +123,13 @@ class DrivePatches:
     without_rows: frozenset[int] = frozenset()
 
     @cached_property
+    def reach_m(self) -> Array:
+        """(L,) median range of the patches of each LiDAR; zero of one that has none."""
+        range_m, own = np.linalg.norm(self.centres_lidar, axis=1), self.scan_lidar[self.scan]
+        per_lidar = [range_m[own == of] for of in range(len(self.lidars))]
+        return np.array([np.median(of) if len(of) else 0.0 for of in per_lidar])
+
+    @cached_property
     def swept_scans(self) -> BoolArray:
         """(M,) whether patches of a scan differ in time.
 

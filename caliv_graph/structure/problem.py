@@ -92,9 +92,8 @@ class Problem:
 
 def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Array:
     """(N, 4, 4) T of the vehicle at each patch's time in the vehicle frame at the scan's stamp."""
-    stamps = patches.stamps_ns[patches.scan]
     begin, end = trajectory.span_ns
-    own = np.clip(stamps + np.round(1e9 * patches.time_s).astype(np.int64), begin, end)
+    own = np.clip(patches.taken_ns, begin, end)
     # Thousands of patches share a time to a tenth of a millisecond. Rounded, not cut off: a time
     # that is too early by the mean shifts all LiDARs along the motion.
     # Not of a cloud without a sweep, in which nothing is left of the rounding but its error.
@@ -105,7 +104,7 @@ def relative_motions(patches: DrivePatches, trajectory: VehicleTrajectory) -> Ar
     R, t = R[inverse.ravel()], t[inverse.ravel()]
     R_s, t_s = trajectory.poses_at(patches.stamps_ns)
     R_s, t_s = R_s[patches.scan], t_s[patches.scan]
-    out = np.zeros((len(stamps), 4, 4))
+    out = np.zeros((len(own), 4, 4))
     out[:, :3, :3] = np.swapaxes(R_s, 1, 2) @ R
     out[:, :3, 3] = np.einsum("nji,nj->ni", R_s, t - t_s)
     out[:, 3, 3] = 1.0

@@ -25,7 +25,6 @@ from caliv_graph.structure.noise import (
     range_sigmas,
     seen_signs,
 )
-from caliv_graph.structure.patches import DrivePatches
 from caliv_graph.structure.problem import (
     Problem,
     add_hold,
@@ -589,15 +588,7 @@ def _step(held: list[Sighted], systems: list[System], tilts: bool) -> tuple[floa
     held.append(replace(after, weights=weights, nuisances=nuisances, unbent=unbent))
     sigmas = math.sqrt(float(step @ np.linalg.solve(cov, step)))
     turns, shifts = np.linalg.norm(step.reshape(-1, 2, 3), axis=2).T
-    return sigmas, float(np.max(turns * _reach_m(problem.patches) + shifts))
-
-
-def _reach_m(patches: DrivePatches) -> Array:
-    """(L,) median range of the patches of each LiDAR; zero of one that has none."""
-    centres = patches.moments[:, :3, 3] / patches.moments[:, 3, 3, None]
-    range_m, own = np.linalg.norm(centres, axis=1), patches.scan_lidar[patches.scan]
-    per_lidar = [range_m[own == of] for of in range(len(patches.lidars))]
-    return np.array([np.median(of) if len(of) else 0.0 for of in per_lidar])
+    return sigmas, float(np.max(turns * problem.patches.reach_m + shifts))
 
 
 def _factor(found: Estimate, system: System) -> tuple[tuple[Array, Array], Array]:

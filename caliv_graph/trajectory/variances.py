@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import gtsam
@@ -48,6 +49,7 @@ from caliv_graph.trajectory.parameters import (
     mount_rotation,
     speed_scale,
 )
+from caliv_graph.trajectory.sample_noise import levels_of_samples
 from caliv_graph.trajectory.states import States, first_nodes
 from caliv_graph.trajectory.wheels import is_planar
 
@@ -172,7 +174,9 @@ def estimated_scales(
         free_components(data),
         columns,
     )
-    return contradicted(likelihood)
+    if data.wheels is not None:
+        return contradicted(likelihood, {})
+    return contradicted(likelihood, levels_of_samples(data.inertial, data.noise, int(nodes[-1])))
 
 
 @dataclass
@@ -329,8 +333,13 @@ TOO_FAR = 1e6
 """-2 log likelihood, beyond that of the stated noise, where it cannot be worked out."""
 
 
-def contradicted(likelihood: NoiseLikelihood) -> dict[str, float]:
-    """The scales that the data set against the stated sigmas; all others are 1."""
+def contradicted(likelihood: NoiseLikelihood, shown: Mapping[str, float]) -> dict[str, float]:
+    """The scales that the data set against the stated sigmas; all others are 1.
+
+    `shown` are the levels that samples themselves show, on the stated ones. Where they are louder,
+    what is stated has no word against the residuals, that mostly say little of a gyroscope: their
+    scale counts without `EVIDENCE`, up to what the samples show.
+    """
     names = set(likelihood.names)
     scales, best = fit(likelihood, names)
     away = {name for name, s in scales.items() if max(s, 1.0 / s) > LARGEST_RIGHT}
@@ -343,7 +352,13 @@ def contradicted(likelihood: NoiseLikelihood) -> dict[str, float]:
     }
     if kept == names:
         return scales
-    return fit(likelihood, kept, start=scales)[0] if kept else {}
+    louder = {
+        name: shown[name]
+        for name in away - kept
+        if scales[name] > LARGEST_RIGHT and shown.get(name, 0.0) > LARGEST_RIGHT
+    }
+    kept |= louder.keys()
+    return fit(likelihood, kept, start=scales, most=louder)[0] if kept else {}
 
 
 def fit(
@@ -351,12 +366,13 @@ def fit(
     free: Set[str],
     enough: float = -math.inf,
     start: Mapping[str, float] | None = None,
+    most: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[dict[str, float], float]:
     """Scales of the `free` noise levels at the maximum of likelihood times prior.
 
     The others are 1. Returns them, and -2 log of likelihood times prior. The fit ends early where
     this falls below `enough`: every step descends, so that it would end below as well. It begins at
-    the scales `start`; None: at the stated noise.
+    the scales `start`; None: at the stated noise. Scales in `most` do not exceed it.
     """
     at = [i for i, name in enumerate(likelihood.names) if name in free]
     names = [likelihood.names[i] for i in at]
@@ -386,21 +402,27 @@ def fit(
         return {}, begin
     if begin <= enough:
         return dict.fromkeys(free, 1.0), begin
-    first = unit * np.log([1.0 if start is None else start[name] for name in names])
+    low, high = SCALE_BOUNDS
+    highest = [min(high, most.get(name, high)) for name in names]
+    begun = [
+        1.0 if start is None else min(start[name], h)
+        for name, h in zip(names, highest, strict=True)
+    ]
+    first = unit * np.log(begun)
     if start is not None and (value := cost(first)[0] + begin) <= enough:
-        return {name: start[name] for name in names}, value
+        return dict(zip(names, begun, strict=True)), value
 
     def check(intermediate_result: OptimizeResult) -> None:
         if intermediate_result.fun + begin <= enough:
             raise StopIteration
 
-    low, high = np.log(SCALE_BOUNDS).tolist()
+    bounds = np.log([[low, h] for h in highest]) * unit[:, None]
     found = minimize(
         cost,
         first,
         jac=True,
         method="L-BFGS-B",
-        bounds=[(low * u, high * u) for u in unit.tolist()],
+        bounds=bounds.tolist(),
         callback=check,
         options={"ftol": 1e-8, "gtol": FIT_TOLERANCE, "maxiter": 30},
     )

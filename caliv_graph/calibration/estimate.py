@@ -19,7 +19,13 @@ from caliv_graph.calibration.drift import about_walls
 from caliv_graph.calibration.given_noise import noise_by_structure, residuals_of_structure
 from caliv_graph.calibration.ground_factors import held
 from caliv_graph.calibration.ground_floors import with_floors
-from caliv_graph.calibration.ground_scatter import GroundLevels, larger_levels
+from caliv_graph.calibration.ground_scatter import (
+    FURTHER_SOLVES,
+    GroundLevels,
+    larger_levels,
+    scattering_more,
+    unsettled_sentence,
+)
 from caliv_graph.calibration.linear import linearise_clouds
 from caliv_graph.calibration.no_target import (
     solution_without_target,
@@ -80,10 +86,6 @@ from caliv_graph.registration.register import JointRegistration, register_jointl
 from caliv_graph.targets.ground.planes import ground_floors
 from caliv_graph.trajectory.deskew import deskewed_with_origins
 from caliv_graph.trajectory.select import VehicleTrajectory
-
-FURTHER_SOLVES = 2
-"""Solves at most that begin at the result of the one before: levels of the ground that are off by
-ten times are right after one, mostly."""
 
 
 def estimate(
@@ -262,16 +264,8 @@ def _unsettled(before: _Whole, after: _Whole | None) -> tuple[str, ...]:
     was, asked = GroundLevels.of(before.problem), GroundLevels.of(after.problem)
     why = "a LiDAR is still far from where the walls were linearised"
     if asked != was:
-        why = (
-            "planes of the ground and heights of the vehicle above it scatter more than their "
-            f"noise levels ({was.text}), as by {asked.text}"
-        )
-    return (
-        f"the result has not settled: solved again {FURTHER_SOLVES} times about itself, {why}. It "
-        "may be off by more than its sigmas: look for ground that is none (a ramp, a kerb, a load "
-        "in view), and for a LiDAR or a vehicle height (ground.vehicle_height) that is far from "
-        "its guess",
-    )
+        why = scattering_more(was, asked)
+    return (unsettled_sentence(why),)
 
 
 @dataclass(frozen=True)

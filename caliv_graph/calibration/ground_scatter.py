@@ -35,6 +35,11 @@ ROUNDS = 40
 """Halvings of the interval in which the variance is looked for."""
 
 
+FURTHER_SOLVES = 2
+"""Solves at most after the first one: levels of the ground that are off by ten times are right
+after one, mostly."""
+
+
 @dataclass(frozen=True)
 class GroundLevels:
     """1 sigma of what moves ground planes and stands from scan to scan.
@@ -76,6 +81,24 @@ class GroundLevels:
 
 MOST = GroundLevels(normal_rad=0.05, distance_m=0.2, heave_m=0.2)
 """Larger levels are no ground and no springs, but a mistake."""
+
+
+def scattering_more(levels: GroundLevels, asked: GroundLevels) -> str:
+    """Why a result asks for another solve, `asked` being larger than its levels."""
+    return (
+        "planes of the ground and heights of the vehicle above it scatter more than their "
+        f"noise levels ({levels.text}), as by {asked.text}"
+    )
+
+
+def unsettled_sentence(why: str) -> str:
+    """Of a result that asks for one more solve after `FURTHER_SOLVES`."""
+    return (
+        f"the result has not settled: solved again {FURTHER_SOLVES} times about itself, {why}. It "
+        "may be off by more than its sigmas: look for ground that is none (a ramp, a kerb, a load "
+        "in view), and for a LiDAR or a vehicle height (ground.vehicle_height) that is far from "
+        "its guess"
+    )
 
 
 def larger_levels(

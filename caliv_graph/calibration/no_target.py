@@ -15,6 +15,14 @@ import numpy as np
 from caliv_graph.calibration.clock_prior import has_clock, under_clock_prior
 from caliv_graph.calibration.graph import initial_values, motion_graph
 from caliv_graph.calibration.ground import drives_with_planes, ground_values
+from caliv_graph.calibration.ground_floors import with_floors
+from caliv_graph.calibration.ground_scatter import (
+    FURTHER_SOLVES,
+    GroundLevels,
+    larger_levels,
+    scattering_more,
+    unsettled_sentence,
+)
 from caliv_graph.calibration.ground_weights import ground_weights
 from caliv_graph.calibration.linear import CloudLinearisation
 from caliv_graph.calibration.noise import first_pose_noise
@@ -92,9 +100,12 @@ class StructureSolve:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Of time offsets that stay undetermined, and of the structure."""
+        """Of time offsets that stay undetermined, of the structure, and of the ground."""
         offsets = undetermined_offset_sentences(self.offsets_s, OFFSET_DETERMINED_S)
-        return (*offsets, *(line for term in self.state.structure for line in term.warnings))
+        of_terms = (line for term in self.state.structure for line in term.warnings)
+        levels, asked = GroundLevels.of(self.state.problem), _levels_at(self)
+        left = [] if asked == levels else [unsettled_sentence(scattering_more(levels, asked))]
+        return (*offsets, *of_terms, *left, *levels.beyond_ground)
 
 
 def solve_structure_and_ground(
@@ -127,20 +138,67 @@ def solve_structure_and_ground(
         raise TargetError("solve.mode staged needs a target", "Set it to auto or joint")
     noise = noise or usual_noise(config.noise)
     pose_noise = pose_noise or first_pose_noise(config.noise)
-    kept = kept_stamps(structure.patches)
     guesses = {name: lidar.guess() for name, lidar in config.lidars.items()}
-    begun = time.perf_counter()
-    with progress.stage("solving walls and other surfaces", None):
-        terms = structure.terms(
-            trajectories,
-            kept,
-            told.T_vehicle_lidar or guesses,
-            {},
-            noise.heave_m,
-            pose_noise,
-            config,
-            aligned=told.aligned,
-        )
+    start = told.T_vehicle_lidar or guesses
+
+    def terms_at(heave_m: float) -> tuple[StructureTerm, ...]:
+        begun = time.perf_counter()
+        with progress.stage("solving walls and other surfaces", None):
+            found = structure.terms(
+                trajectories,
+                kept_stamps(structure.patches),
+                start,
+                {},
+                heave_m,
+                pose_noise,
+                config,
+                aligned=told.aligned,
+            )
+        times["structure"] = times.get("structure", 0.0) + time.perf_counter() - begun
+        return found
+
+    times: dict[str, float] = {}
+    terms = terms_at(noise.heave_m)
+    solved = _solved(trajectories, config, progress, grounds, terms, noise, pose_noise, times)
+    for _ in range(FURTHER_SOLVES):
+        asked = _levels_at(solved)
+        if asked == GroundLevels.of(solved.state.problem):
+            break
+        before, noise = noise, noise.with_ground_levels(asked)
+        # About the guesses: planes that scatter may have led far from them.
+        grounds = with_floors(grounds, trajectories, start, before.floors, noise.floors)
+        if noise.heave_m != before.heave_m:
+            terms = terms_at(noise.heave_m)
+        solved = _solved(trajectories, config, progress, grounds, terms, noise, pose_noise, times)
+    return solved
+
+
+def _levels_at(solved: StructureSolve) -> GroundLevels:
+    """The levels of the ground that a solution asks for."""
+    state = solved.state
+    if state.ground_weights is None:
+        return GroundLevels.of(state.problem)
+    return larger_levels(
+        state.problem, state.grounds, state.ground_weights, state.values, state.config
+    )
+
+
+def _solved(
+    trajectories: Sequence[VehicleTrajectory],
+    config: Config,
+    progress: Progress,
+    grounds: tuple[GroundObservation, ...],
+    terms: tuple[StructureTerm, ...],
+    noise: SensorNoise,
+    pose_noise: PoseNoise,
+    times: dict[str, float],
+) -> StructureSolve:
+    """Solves the graph of some terms of structure and the ground; `times` are added to.
+
+    Raises:
+        TargetError: there is no term.
+        SolveError: it could not be solved.
+    """
     others = lidars_with_structure(terms)
     if not others:
         raise TargetError(
@@ -148,19 +206,17 @@ def solve_structure_and_ground(
             "Drive past walls or a chair within 20 m, and check topics and guesses with "
             "'caliv-graph inspect --html'",
         )
-    grounds = other_grounds(grounds, terms)
-    times = {"structure": time.perf_counter() - begun}
     begun = time.perf_counter()
     stamps = {term.drive: term.stamps_ns for term in terms}
     problem = pose_problem([], trajectories, config, noise, others, stamps)
     with progress.stage("solving the graph", COUPLED_STEPS) as advance:
-        loop = _Loop(problem, terms, grounds, config, pose_noise)
+        loop = _Loop(problem, terms, other_grounds(grounds, terms), config, pose_noise)
         loop.solve(advance)
         if has_clock(problem):
             loop.again(under_clock_prior(loop.state, loop.reduced, loop.undetermined), advance)
             problem = loop.state.problem
         offsets_s = reduced_offset_sigmas(problem, loop.reduced)
-    times["graph"] = time.perf_counter() - begun
+    times["graph"] = times.get("graph", 0.0) + time.perf_counter() - begun
     return StructureSolve(
         loop.state,
         loop.reduced,

@@ -62,9 +62,12 @@ def typical_gap(values: Array) -> float:
     """
     if len(values) < 2:
         return 0.0
-    gaps = np.sort(np.diff(np.sort(values)))
-    covered = np.cumsum(gaps)
-    return float(gaps[int(np.searchsorted(covered, 0.5 * covered[-1]))])
+    gaps = np.diff(np.sort(values))
+    half = 0.5 * float(gaps.sum())
+    # All of the others together are less than half: those within rows, mostly, and not sorted.
+    large = np.sort(gaps[gaps >= half / len(gaps)])
+    covered = 2.0 * half - float(large.sum()) + np.cumsum(large)
+    return float(large[min(int(np.searchsorted(covered, half)), len(large) - 1)])
 
 
 def beam_spacing(near_lidar: Array, scan_elevations: Array) -> BeamSpacing:

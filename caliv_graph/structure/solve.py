@@ -124,7 +124,11 @@ class Estimate:
         """
         state = self.state
         stands = stands_of(
-            state.t_map_vehicle, state.centres_map, state.normals_map, self.problem.standing
+            state.R_map_vehicle,
+            state.t_map_vehicle,
+            state.centres_map,
+            state.normals_map,
+            self.problem.standing,
         )
         return stands.only(np.isin(stands.pose, self.problem.pose_of_scan))
 

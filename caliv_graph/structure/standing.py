@@ -29,6 +29,11 @@ TOO_HIGH_M = 0.5
 wheels, beside three of its sigmas. Guesses leave the height of all LiDARs open by less: tape
 measures and drawings are good to a decimetre. Decks, roofs and benches are higher."""
 
+TILTED_RAD = 0.1
+"""Largest tilt of a strip below the vehicle from the median in its frame: a ramp that its wheels
+are on tilts the vehicle as well, and guesses that are off tilt all strips alike. A steeper one is
+the lid of a box or the foot of a bush, and its height goes with where the vehicle is beside it."""
+
 FITTING = 0.1
 """Part of the poses above level strips that are above one that is not too high, at least. Where
 fewer are, all strips count: a wrong `vehicle_height` has all of them too high, and the result shows
@@ -70,6 +75,7 @@ class Stands:
 
 
 def stands_of(
+    R_map_vehicle: Array,
     t_map_vehicle: Array,
     centres_map: Array,
     normals_map: Array,
@@ -78,6 +84,7 @@ def stands_of(
     """The level strip below each pose, where there is one.
 
     Args:
+        R_map_vehicle: (M, 3, 3).
         t_map_vehicle: (M, 3) metres.
         centres_map: (K, 3) of all strips.
         normals_map: (K, 3).
@@ -97,6 +104,12 @@ def stands_of(
     fitting = near & (heights > _least_height_m(standing))
     if fitting.any(axis=1).sum() > FITTING * near.any(axis=1).sum():
         near = fitting
+    below = np.flatnonzero(near.any(axis=1))
+    if not len(below):
+        return Stands(none, none)
+    tilts = np.einsum("mji,mkj->mki", R_map_vehicle, normals_map[strip])[..., :2]
+    usual_tilt = np.median(tilts[below, near[below].argmax(axis=1)], axis=0)
+    near &= np.linalg.norm(tilts - usual_tilt, axis=-1) < TILTED_RAD
     below = np.flatnonzero(near.any(axis=1))
     first = below, near[below].argmax(axis=1)
     strip, height = strip[first], heights[first]

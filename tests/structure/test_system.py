@@ -10,6 +10,7 @@ import scipy.sparse
 from caliv_graph.errors import SolveError
 from caliv_graph.geometry.chart import PoseChart
 from caliv_graph.geometry.se3 import stack
+from caliv_graph.products import Array
 from caliv_graph.structure.beams import CHANNEL_KINDS, BeamErrors, BeamGroups, seen_beams
 from caliv_graph.structure.bends import BENDS
 from caliv_graph.structure.elimination import eliminated, factor_of, solved
@@ -314,11 +315,15 @@ def test_derivatives_of_how_the_vehicle_stands() -> None:
         assert J[:, k] == pytest.approx(change / 2e-6, abs=1e-4 * np.abs(J).max())
 
 
+def level_poses(t_map_vehicle: Array) -> Array:
+    return np.tile(np.eye(3), (len(t_map_vehicle), 1, 1))
+
+
 def test_a_vehicle_stands_on_the_strip_below_it_only() -> None:
     centres = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [4.0, 0.2, 1.0]])
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     at = np.array([[0.5, 0.5, 1.0], [4.1, 0.3, 1.0], [9.0, 0.0, 1.0]])
-    stands = stands_of(at, centres, normals)
+    stands = stands_of(level_poses(at), at, centres, normals)
     assert stands.pose.tolist() == [0, 1]
     assert stands.strip.tolist() == [0, 1]
 
@@ -332,16 +337,41 @@ def test_the_vehicle_stands_on_the_ground_and_not_on_its_own_roof() -> None:
     at = np.column_stack([x, 0.0 * x, 0.0 * x])
     normals = np.tile([0.0, 0.0, 1.0], (11, 1))
     both = np.vstack([roof, floor])
-    stands = stands_of(at, both, normals, STANDING)
+    stands = stands_of(level_poses(at), at, both, normals, STANDING)
     assert (stands.pose.tolist(), stands.strip.tolist()) == ([0, 1, 2], [8, 9, 10])
     assert above_ground_m(STANDING, stands, at, both, normals) == 0.0
     # Without a height nothing tells which of them carries the wheels.
     unknown = replace(STANDING, height_m=None)
-    assert stands_of(at, both, normals, unknown).strip.tolist() == list(range(8))
-    assert stands_of(at, both, normals).strip.tolist() == list(range(8))
+    assert stands_of(level_poses(at), at, both, normals, unknown).strip.tolist() == list(range(8))
+    assert stands_of(level_poses(at), at, both, normals).strip.tolist() == list(range(8))
     # So does a height with such a sigma.
     vague = replace(STANDING, height_sigma_m=0.5)
-    assert stands_of(at, both, normals, vague).strip.tolist() == list(range(8))
+    assert stands_of(level_poses(at), at, both, normals, vague).strip.tolist() == list(range(8))
+
+
+def test_a_vehicle_stands_on_no_slope_that_does_not_tilt_it() -> None:
+    """The lid of a box is 23 degrees steep and nearer than the ground; then a ramp all tilt by."""
+    x = 2.0 * np.arange(6.0)
+    at = np.column_stack([x, 0.0 * x, 0.0 * x])
+    ground = np.column_stack([x, 0.5 + 0.0 * x, -0.3 + 0.0 * x])
+    lid = np.array([[4.0, 0.2, -0.29], [20.0, 0.0, -0.3]])
+    turned = gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0).matrix()
+    normals = np.vstack([np.tile([0.0, 0.0, 1.0], (6, 1)), np.tile(turned[:, 2], (2, 1))])
+    both = np.vstack([ground, lid])
+    at = np.vstack([at, [20.0, 0.1, 0.0]])
+
+    stands = stands_of(level_poses(at), at, both, normals, STANDING)
+
+    assert (stands.pose.tolist(), stands.strip.tolist()) == ([*range(6)], [*range(6)])
+    # On the ramp at the end the vehicle is tilted as well.
+    on_ramp = level_poses(at)
+    on_ramp[6] = turned
+    stands = stands_of(on_ramp, at, both, normals, STANDING)
+    assert (stands.pose.tolist(), stands.strip.tolist()) == ([*range(7)], [*range(6), 7])
+    # Guesses that are off tilt all strips alike.
+    tilted = np.array([gtsam.Rot3.RzRyRx(0.15, 0.1, 1.0).matrix() @ R for R in level_poses(at)])
+    stands = stands_of(tilted, at, both, normals, STANDING)
+    assert stands.strip.tolist() == [*range(6)]
 
 
 def test_strips_that_are_all_too_high_stay_and_are_told() -> None:
@@ -350,7 +380,7 @@ def test_strips_that_are_all_too_high_stay_and_are_told() -> None:
     centres = np.array([[0.0, 0.1, 0.9], [2.0, 0.1, 0.9]])
     normals = np.tile([0.0, 0.0, 1.0], (2, 1))
     high = replace(STANDING, height_m=1.3)
-    stands = stands_of(at, centres, normals, high)
+    stands = stands_of(level_poses(at), at, centres, normals, high)
     assert stands.strip.tolist() == [0, 1]
     assert above_ground_m(high, stands, at, centres, normals) == pytest.approx(1.2)
     near = replace(STANDING, height_m=0.6)

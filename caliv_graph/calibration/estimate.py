@@ -22,6 +22,7 @@ from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.ground_scatter import (
     FURTHER_SOLVES,
     GroundLevels,
+    failed_sentence,
     larger_levels,
     scattering_more,
     unsettled_sentence,
@@ -195,13 +196,7 @@ def _estimate(
         try:
             solved = _solved(larger, observations, solved.state, NOTHING_TOLD, times, progress)
         except (RegistrationError, SolveError) as error:
-            left = (
-                "the result asks for another solve, about it and with its noise levels, which "
-                f"failed: {error.what.rstrip('.')}. The result is that of the solve before, which "
-                "may be off by more than its sigmas: better initial guesses "
-                "(lidars.<name>.initial) and more scans of the target lead to one that needs no "
-                "other",
-            )
+            left = (failed_sentence(error.what),)
             break
         whole = larger
     else:

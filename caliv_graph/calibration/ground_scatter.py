@@ -94,10 +94,20 @@ def scattering_more(levels: GroundLevels, asked: GroundLevels) -> str:
 def unsettled_sentence(why: str) -> str:
     """Of a result that asks for one more solve after `FURTHER_SOLVES`."""
     return (
-        f"the result has not settled: solved again {FURTHER_SOLVES} times about itself, {why}. It "
-        "may be off by more than its sigmas: look for ground that is none (a ramp, a kerb, a load "
-        "in view), and for a LiDAR or a vehicle height (ground.vehicle_height) that is far from "
-        "its guess"
+        f"the result has not settled: solved again {FURTHER_SOLVES} times with what it asked for, "
+        f"{why}. It may be off by more than its sigmas: look for ground that is none (a ramp, a "
+        "kerb, a load in view), and for a LiDAR or a vehicle height (ground.vehicle_height) that "
+        "is far from its guess"
+    )
+
+
+def failed_sentence(what: str) -> str:
+    """Of a result that asks for another solve, which fails; `what` is its error."""
+    return (
+        "the result asks for another solve, about it and with its noise levels, which "
+        f"failed: {what.rstrip('.')}. The result is that of the solve before, which "
+        "may be off by more than its sigmas: better initial guesses "
+        "(lidars.<name>.initial) and more scans lead to one that needs no other"
     )
 
 

@@ -19,6 +19,7 @@ from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.ground_scatter import (
     FURTHER_SOLVES,
     GroundLevels,
+    failed_sentence,
     larger_levels,
     scattering_more,
     unsettled_sentence,
@@ -56,7 +57,7 @@ from caliv_graph.calibration.structure_evidence import (
 )
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config
-from caliv_graph.errors import TargetError
+from caliv_graph.errors import SolveError, TargetError
 from caliv_graph.products import (
     Array,
     GroundObservation,
@@ -87,6 +88,7 @@ class StructureSolve:
         converged: whether the last step was small.
         noise: heave and waves of the ground.
         times_s: seconds per stage.
+        failed: error of another solve that this one asked for; None: there is none.
     """
 
     state: SolveState
@@ -97,6 +99,7 @@ class StructureSolve:
     converged: bool
     noise: SensorNoise
     times_s: dict[str, float]
+    failed: str | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -104,7 +107,9 @@ class StructureSolve:
         offsets = undetermined_offset_sentences(self.offsets_s, OFFSET_DETERMINED_S)
         of_terms = (line for term in self.state.structure for line in term.warnings)
         levels, asked = GroundLevels.of(self.state.problem), _levels_at(self)
-        left = [] if asked == levels else [unsettled_sentence(scattering_more(levels, asked))]
+        left = () if asked == levels else (unsettled_sentence(scattering_more(levels, asked)),)
+        if self.failed is not None:
+            left = (failed_sentence(self.failed),)
         return (*offsets, *of_terms, *left, *levels.beyond_ground)
 
 
@@ -167,9 +172,15 @@ def solve_structure_and_ground(
         before, noise = noise, noise.with_ground_levels(asked)
         # About the guesses: planes that scatter may have led far from them.
         grounds = with_floors(grounds, trajectories, start, before.floors, noise.floors)
-        if noise.heave_m != before.heave_m:
-            terms = terms_at(noise.heave_m)
-        solved = _solved(trajectories, config, progress, grounds, terms, noise, pose_noise, times)
+        try:
+            if noise.heave_m != before.heave_m:
+                terms = terms_at(noise.heave_m)
+            again = _solved(
+                trajectories, config, progress, grounds, terms, noise, pose_noise, times
+            )
+        except (SolveError, TargetError) as error:
+            return replace(solved, failed=error.what)
+        solved = again
     return solved
 
 

@@ -29,10 +29,15 @@ TOO_HIGH_M = 0.5
 wheels, beside three of its sigmas. Guesses leave the height of all LiDARs open by less: tape
 measures and drawings are good to a decimetre. Decks, roofs and benches are higher."""
 
-TILTED_RAD = 0.1
+TILTED_RAD = 0.2
 """Largest tilt of a strip below the vehicle from the median in its frame: a ramp that its wheels
-are on tilts the vehicle as well, and guesses that are off tilt all strips alike. A steeper one is
-the lid of a box or the foot of a bush, and its height goes with where the vehicle is beside it."""
+are on tilts the vehicle as well, and rough guesses are off by less than half of it, which turns
+with the heading. A steeper one is the lid of a box or the foot of a bush, and its height goes with
+where the vehicle is beside it."""
+
+MOSTLY = 0.5
+"""Part of the poses above level strips that are above one that is not so tilted, at least. Where
+fewer are, nothing tells which strips the wheels are on, and all count."""
 
 FITTING = 0.1
 """Part of the poses above level strips that are above one that is not too high, at least. Where
@@ -109,8 +114,10 @@ def stands_of(
         return Stands(none, none)
     tilts = np.einsum("mji,mkj->mki", R_map_vehicle, normals_map[strip])[..., :2]
     usual_tilt = np.median(tilts[below, near[below].argmax(axis=1)], axis=0)
-    near &= np.linalg.norm(tilts - usual_tilt, axis=-1) < TILTED_RAD
-    below = np.flatnonzero(near.any(axis=1))
+    alike = near & (np.linalg.norm(tilts - usual_tilt, axis=-1) < TILTED_RAD)
+    if alike.any(axis=1).sum() >= MOSTLY * len(below):
+        near = alike
+        below = np.flatnonzero(near.any(axis=1))
     first = below, near[below].argmax(axis=1)
     strip, height = strip[first], heights[first]
     # The nearest strip may be a kerb beside the wheels.

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from caliv_graph.calibration import no_target
+from caliv_graph.calibration.ground_scatter import GroundLevels
 from caliv_graph.calibration.no_target import (
     StructureSolve,
     solution_without_target,
@@ -15,7 +17,7 @@ from caliv_graph.calibration.no_target import (
 from caliv_graph.calibration.structure_evidence import StructureEvidence
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.model import Config
-from caliv_graph.errors import TargetError
+from caliv_graph.errors import SolveError, TargetError
 from caliv_graph.products import GroundObservation
 from caliv_graph.targets.ground.planes import NORMAL_FLOOR_RAD
 from caliv_graph.trajectory.select import GivenTrajectory
@@ -91,6 +93,41 @@ def test_waves_that_the_config_states_are_held(monkeypatch: pytest.MonkeyPatch) 
     found, _ = solved(monkeypatch, 0.02, config.model_copy(update={"noise": noise}))
 
     assert found.noise.floors[0] == pytest.approx(np.radians(0.03))
+
+
+def test_another_solve_that_fails_leaves_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    solve, calls = no_target._solved, 0
+
+    def once(*arguments: Any) -> StructureSolve:
+        nonlocal calls
+        calls += 1
+        if calls > 1:
+            raise SolveError("The graph is singular.")
+        return solve(*arguments)
+
+    monkeypatch.setattr(no_target, "_solved", once)
+
+    hilly, _ = solved(monkeypatch, 0.02, config_of(*LIDARS))
+
+    assert calls == 2
+    assert hilly.noise.floors[0] == NORMAL_FLOOR_RAD
+    (said,) = hilly.warnings
+    assert "asks for another solve" in said
+    assert "failed: The graph is singular. The result is that of the solve before" in said
+
+
+def test_a_result_that_never_settles_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = iter(0.001 * 2.0 ** np.arange(9))
+
+    def louder(*_: Any) -> GroundLevels:
+        return GroundLevels(float(next(levels)), 0.002, 0.005)
+
+    monkeypatch.setattr(no_target, "larger_levels", louder)
+
+    found, _ = solved(monkeypatch, 0.0, config_of(*LIDARS))
+
+    (said,) = found.warnings
+    assert "has not settled: solved again 2 times with what it asked for, planes of" in said
 
 
 def test_structure_that_says_nothing_is_an_error() -> None:

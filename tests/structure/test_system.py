@@ -368,10 +368,25 @@ def test_a_vehicle_stands_on_no_slope_that_does_not_tilt_it() -> None:
     on_ramp[6] = turned
     stands = stands_of(on_ramp, at, both, normals, STANDING)
     assert (stands.pose.tolist(), stands.strip.tolist()) == ([*range(7)], [*range(6), 7])
-    # Guesses that are off tilt all strips alike.
+    # Guesses that are off tilt all strips alike in the vehicle frame, to one side there and to the
+    # other back.
+    there_and_back = np.array(
+        [gtsam.Rot3.RzRyRx(0.0, 0.09, yaw).matrix() for yaw in (0.0, 0.0, 0.0, 0.0, np.pi, np.pi)]
+    )
+    stands = stands_of(there_and_back, at[:6], both, normals, STANDING)
+    assert stands.strip.tolist() == [*range(6)]
+    # Another guess, on one heading.
     tilted = np.array([gtsam.Rot3.RzRyRx(0.15, 0.1, 1.0).matrix() @ R for R in level_poses(at)])
     stands = stands_of(tilted, at, both, normals, STANDING)
     assert stands.strip.tolist() == [*range(6)]
+
+
+def test_where_strips_differ_none_is_taken_for_a_lid() -> None:
+    at = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+    centres = at - [0.0, 0.0, 0.3]
+    normals = np.array([gtsam.Rot3.RzRyRx(0.0, p, 0.0).matrix()[:, 2] for p in (0.25, -0.25)])
+
+    assert stands_of(level_poses(at), at, centres, normals).strip.tolist() == [0, 1]
 
 
 def test_strips_that_are_all_too_high_stay_and_are_told() -> None:

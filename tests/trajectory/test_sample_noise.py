@@ -25,10 +25,12 @@ STATED = ImuNoise(
 FOREVER = 10**18
 
 
-def samples(rate_hz: float, seconds: float, gyro: float = 1.0, force: float = 1.0) -> Inertial:
+def samples(
+    rate_hz: float, seconds: float, gyro: float = 1.0, force: float = 1.0, seed: int = 7
+) -> Inertial:
     """White noise on a vehicle that turns, `gyro` and `force` times what is stated."""
     t = np.arange(0.0, seconds, 1.0 / rate_hz)
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(seed)
     turns = 0.3 * np.sin(2.0 * t)[:, None] + np.zeros(3)
     white = np.sqrt(rate_hz) * rng.normal(size=(2, len(t), 3))
     return Inertial(
@@ -68,6 +70,49 @@ def test_lines_and_loud_octaves_are_no_white_noise() -> None:
     assert found["gyroscope"] == pytest.approx(1.0, rel=0.06)
 
 
+def test_bumps_and_glitches_are_no_white_noise() -> None:
+    """They are as loud in all octaves, but for an instant only."""
+    inertial = samples(100.0, 60.0)
+    knock = np.zeros((6000, 3))
+    knock[1000] = 1.0
+    knock[3000:3002] = 0.3
+    knock[4000:4100] = 0.03 * np.random.default_rng(1).normal(size=(100, 3))
+
+    found = levels_of_samples(added(inertial, knock), STATED, FOREVER)
+
+    assert found["gyroscope"] == pytest.approx(1.0, rel=0.08)
+
+
+def test_ten_segments_tell_a_level() -> None:
+    levels = [
+        levels_of_samples(samples(100.0, 11.0, seed=seed), STATED, FOREVER)["gyroscope"]
+        for seed in range(10)
+    ]
+
+    assert np.mean(levels) == pytest.approx(1.0, abs=0.08)
+    assert np.max(levels) < 1.1
+
+
+@pytest.mark.parametrize("rate_hz", [19.99, 20.0, 20.01])
+def test_one_octave_of_a_slow_imu_is_asked(rate_hz: float) -> None:
+    found = levels_of_samples(samples(rate_hz, 60.0, 4.0), STATED, FOREVER)
+
+    assert found["gyroscope"] == pytest.approx(4.0, rel=0.1)
+
+
+def test_samples_of_another_rate_are_left_out() -> None:
+    slow, fast = samples(100.0, 40.0), samples(200.0, 18.0)
+    end_ns = int(slow.stamps_ns[-1]) + 10_000_000
+    both = Inertial(
+        np.concatenate([slow.stamps_ns, end_ns + fast.stamps_ns]),
+        np.concatenate([slow.gyro, fast.gyro]),
+        np.concatenate([slow.force, fast.force]),
+        NO_GAPS,
+    )
+
+    assert levels_of_samples(both, STATED, FOREVER)["gyroscope"] == pytest.approx(1.0, rel=0.06)
+
+
 def test_only_samples_up_to_the_last_stamp_count() -> None:
     inertial = samples(100.0, 40.0)
     gyro = inertial.gyro.copy()
@@ -88,7 +133,9 @@ def test_segments_with_a_gap_are_left_out() -> None:
     assert levels_of_samples(beside, STATED, FOREVER)["gyroscope"] == pytest.approx(1.0, rel=0.06)
 
 
-@pytest.mark.parametrize(("rate_hz", "seconds"), [(100.0, 5.0), (15.0, 60.0), (100.0, 0.01)])
+@pytest.mark.parametrize(
+    ("rate_hz", "seconds"), [(100.0, 5.0), (15.0, 60.0), (100.0, 0.01), (0.2, 600.0)]
+)
 def test_few_or_slow_samples_tell_nothing(rate_hz: float, seconds: float) -> None:
     assert levels_of_samples(samples(rate_hz, seconds), STATED, FOREVER) == {}
 

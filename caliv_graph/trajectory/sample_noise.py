@@ -21,8 +21,12 @@ LOWEST_HZ = 5.0
 """Lower end of the octaves: a vehicle's body turns and rocks below."""
 
 FEWEST = 10
-"""Segments that tell a spectrum, of eleven seconds: the quietest octave of five comes out 11
-percent too quiet, of ten 6, of forty 3, by chance."""
+"""Segments that tell a spectrum, of eleven seconds: the quietest octave of five comes out 7 percent
+too quiet, of ten 4, of forty 2, by chance."""
+
+KNOCK = 4.0
+"""Power of a segment over the median from which it does not count: a bump or a door that is slammed
+is as loud in all octaves, and a segment of five bins is three times as loud as usual by chance."""
 
 STEADY = 1.1
 """A segment's length over that of evenly spaced samples, or its inverse, at most: a longer one has
@@ -58,12 +62,8 @@ def levels_of_samples(inertial: Inertial, noise: ImuNoise, until_ns: int) -> dic
         ("gyroscope", inertial.gyro[used], noise.gyro_density),
         ("accelerometer", inertial.force[used], noise.force_density),
     ):
-        # By medians: a bump or a door that is slammed is as loud at all frequencies, in a segment
-        # or two, and an engine in a few bins.
-        power = np.median(_powers(samples, starts, length, period_s), axis=0)
-        power /= _median_of_exponentials(len(starts)) * np.diagonal(density)
-        levels = [np.median(np.median(power[octave], axis=0)) for octave in octaves]
-        out[name] = float(np.sqrt(min(levels)))
+        power = _powers(samples, starts, length, period_s) / np.diagonal(density)
+        out[name] = float(np.sqrt(min(_level(power[:, octave]) for octave in octaves)))
     return out
 
 
@@ -86,10 +86,16 @@ def _octaves(length: int, period_s: float) -> list[slice]:
     return out
 
 
-def _median_of_exponentials(n: int) -> float:
-    """Expected median of n powers of mean 1, which are exponentially distributed; ln 2 of many."""
-    k = np.arange(1, (n - 1) // 2 + 1)
-    return 1.0 + float(np.sum(1.0 / (2 * k + 1) - 1.0 / (2 * k)))
+def _level(power: Array) -> float:
+    """Of (segments, bins, 3) powers of an octave the white noise, by the middle one of the axes.
+
+    The mean over the segments, as noise that comes with the speed counts by its mean, without those
+    that are loud by themselves; of the bins the median, as an engine is in a few.
+    """
+    of_segments = np.median(power, axis=1)
+    knocked = of_segments > KNOCK * np.median(of_segments, axis=0)
+    mean = np.nanmean(np.where(knocked[:, None], np.nan, power), axis=0)
+    return float(np.median(np.median(mean, axis=0)))
 
 
 def _powers(samples: Array, starts: IntArray, length: int, period_s: float) -> Array:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import caliv_graph.calibration.estimate as stages
-from caliv_graph.calibration.ground_scatter import MOST, GroundLevels
+from caliv_graph.calibration.ground_scatter import FURTHER_SOLVES, MOST, GroundLevels
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.errors import SolveError
 from caliv_graph.pipeline import calibrate
@@ -82,8 +82,8 @@ def test_a_result_that_asks_for_one_more_solve_after_the_last_says_so(
     warnings = run.calibration.warnings
 
     said = [line for line in warnings if "has not settled: solved again 2 times" in line]
-    assert calls == min(solves, 1 + stages.FURTHER_SOLVES)
-    assert len(said) == (solves > stages.FURTHER_SOLVES + 1)
+    assert calls == min(solves, 1 + FURTHER_SOLVES)
+    assert len(said) == (solves > FURTHER_SOLVES + 1)
 
 
 def test_levels_that_no_ground_has_are_a_warning() -> None:

@@ -16,6 +16,7 @@ from caliv_graph.calibration.refine import LAST_STEPS
 from caliv_graph.calibration.robust import FAR_OFF
 from caliv_graph.calibration.score_tests import MIN_YAW_RATE_RAD_S, score_tests
 from caliv_graph.calibration.suspect_values import ranked_suspects
+from caliv_graph.calibration.vehicle_parameters import sigmas_from_stated
 from caliv_graph.config.model import Config
 from caliv_graph.errors import SolveError, TrajectoryError
 from caliv_graph.products import (
@@ -58,7 +59,7 @@ from caliv_graph.wording.contradictions import (
     together_doubt,
 )
 from caliv_graph.wording.offsets import late_clock_sentences
-from caliv_graph.wording.suspects import doubt_sentence, ranking_sentence
+from caliv_graph.wording.suspects import doubt_sentence, moved_sentence, ranking_sentence
 
 _MOTION_INPUTS = ("gnss.", "poses.", "imu.", "twist.", "wheels.", "heading.")
 """How the names of suspects begin that turn the trajectory, or its heading, themselves."""
@@ -168,7 +169,8 @@ def check(
         for index, heading in headings.items()
         if heading.warning and not turned and drives[index] not in said
     )
-    doubts = list(filter(None, [doubt_sentence(suspects)]))
+    far = "" if leads else moved_sentence(sigmas_from_stated(calibration.vehicle, trajectories))
+    doubts = list(filter(None, [doubt_sentence(suspects), far]))
     of_guesses = any(isinstance(each, GuessContradiction | GuessesTogether) for each in found)
     frame = None if leads or of_guesses else perhaps_together(calibration.lidars)
     if (of_all or frame is not None) and suspects and suspects[0].input.endswith(".initial"):

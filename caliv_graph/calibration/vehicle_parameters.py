@@ -251,6 +251,29 @@ def estimated_parameters(
     return out
 
 
+def sigmas_from_stated(
+    vehicle: Mapping[str, VehicleParameter], trajectories: Sequence[VehicleTrajectory]
+) -> dict[str, float]:
+    """How far places and rotations that the user measured come out from there, in his sigmas.
+
+    The largest of the three coordinates, by the name of the input. Under a right model data that do
+    not determine them leave them where they are.
+    """
+    smoothed = [t for t in trajectories if isinstance(t, SmoothedTrajectory)]
+    out = {}
+    for name, prior in parameter_priors(smoothed).items():
+        if name in CLOCKS or NAMES[name] not in vehicle:
+            continue
+        value, mean = vehicle[NAMES[name]].value, prior.mean
+        if isinstance(mean, gtsam.Rot3):
+            R = gtsam.Rot3.RzRyRx(*np.asarray(value).tolist())
+            away = gtsam.Rot3.Logmap(R.compose(mean.inverse()))
+        else:
+            away = value - mean
+        out[name] = float(np.max(np.abs(away) / prior.sigmas))
+    return out
+
+
 def drive_parameters(trajectories: Sequence[VehicleTrajectory]) -> dict[str, VehicleParameter]:
     """Scale of the speeds and yaw of a baseline, of the drives on which they were estimated.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from caliv_graph.products import Finding, MountSlip, Suspect
@@ -45,6 +45,25 @@ def _or_axle(arm: Suspect) -> str:
     return (
         f". Or the axle that does not steer is elsewhere: wheels.T_vehicle_wheels.xyz by {other}, "
         "if guesses of LiDARs are contradicted as well"
+    )
+
+
+MOVED_SIGMAS = 4.0
+"""An input that comes out farther from what is stated, in its own sigmas, is told of: one sound
+coordinate of 16,000."""
+
+
+def moved_sentence(sigmas: Mapping[str, float]) -> str:
+    """Inputs that come out far from what is stated; otherwise empty. `sigmas` by their names."""
+    moved = {name: of for name, of in sigmas.items() if of > MOVED_SIGMAS}
+    if not moved:
+        return ""
+    inputs = " and ".join(f"{name} ({of:.1f} sigma)" for name, of in moved.items())
+    return (
+        f"{inputs}: the result is that far from what the config states, as the LiDARs pull the "
+        "vehicle frame there. S2V may be off by as much. Measure it again; if it is right, look at "
+        "what holds the vehicle frame: ground.vehicle_height, ground that is none (lids, ramps, "
+        "kerbs), the initial guesses"
     )
 
 

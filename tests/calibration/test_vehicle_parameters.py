@@ -17,10 +17,12 @@ from caliv_graph.calibration.vehicle_parameters import (
     estimated_parameters,
     motion_term,
     parameter_priors,
+    sigmas_from_stated,
 )
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_imu_place, key_imu_rotation, key_lever_arm
-from caliv_graph.products import Array, TargetCloud, TargetObservation
+from caliv_graph.products import Array, TargetCloud, TargetObservation, VehicleParameter
+from caliv_graph.trajectory.parameters import IMU_ROTATION, LEVER_ARM
 from caliv_graph.trajectory.smooth import smooth_trajectory
 from caliv_graph.trajectory.smoothed import SmoothedTrajectory
 from tests.trajectory.motions import Course, config_for, eight_drive, mounted_askew, record, stamps
@@ -213,3 +215,24 @@ def test_verdicts_on_a_lever_arm(
     assert arm.value.tolist() == [1.0, 2.0, 3.0]
     assert arm.determined == (determined,) * 3
     assert arm.sigma == pytest.approx([reported_m] * 3)
+
+
+def test_how_far_a_result_is_from_what_was_measured_is_in_its_sigmas() -> None:
+    smoothed = drive(0)
+    priors = parameter_priors([smoothed])
+    arm, turned = priors[LEVER_ARM.name], priors[IMU_ROTATION.name]
+    assert isinstance(turned.mean, gtsam.Rot3)
+    assert not isinstance(arm.mean, gtsam.Rot3)
+    # About the vehicle's y axis, as its sigmas are.
+    R = gtsam.Rot3.Expmap(np.array([0.0, 3.0 * turned.sigmas[1], 0.0])).compose(turned.mean)
+    vehicle = {
+        "lever_arm": VehicleParameter(
+            arm.mean + np.array([0.0, 1.0, -5.0]) * arm.sigmas, arm.sigmas, (False,) * 3
+        ),
+        "imu_rotation": VehicleParameter(R.rpy(), turned.sigmas, (False,) * 3),
+        "gnss_time_offset": VehicleParameter(np.ones(1), np.ones(1), (False,)),
+    }
+
+    found = sigmas_from_stated(vehicle, [smoothed])
+
+    assert found == pytest.approx({LEVER_ARM.name: 5.0, IMU_ROTATION.name: 3.0}, rel=1e-6)

@@ -11,6 +11,7 @@ from caliv_graph.products import MountSlip, Suspect
 from caliv_graph.wording.suspects import (
     doubt_sentence,
     motion_sentence,
+    moved_sentence,
     ranking_sentence,
     remedy,
     slip_finding,
@@ -158,3 +159,11 @@ def test_a_mount_that_slips_is_named_with_its_size_and_what_to_do() -> None:
     assert f"they are {SIZE}. " in together
     assert "Check whether their common rack, the IMU or an antenna moved" in together
     assert slip_finding("drive", replace(SLIP, sigmas=3.9)) is None
+
+
+def test_what_is_stated_is_told_of_where_the_result_is_far_from_it() -> None:
+    assert moved_sentence({"gnss.lever_arm": 3.9, "imu.T_vehicle_imu": 0.2}) == ""
+    said = moved_sentence({"gnss.lever_arm": 4.66, "imu.T_vehicle_imu": 3.4})
+    assert said.startswith("gnss.lever_arm (4.7 sigma): the result is that far from what")
+    both = moved_sentence({"gnss.lever_arm": 4.66, "imu.T_vehicle_imu.xyz": 5.24})
+    assert both.startswith("gnss.lever_arm (4.7 sigma) and imu.T_vehicle_imu.xyz (5.2 sigma): ")

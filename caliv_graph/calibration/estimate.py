@@ -22,8 +22,8 @@ from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.ground_scatter import (
     FURTHER_SOLVES,
     GroundLevels,
+    asked_levels,
     failed_sentence,
-    larger_levels,
     scattering_more,
     unsettled_sentence,
 )
@@ -237,10 +237,8 @@ def _for_another_solve(
     ground planes and stands that scatter more at the result than was estimated have larger sigmas.
     """
     grounds, noise, config = whole.grounds, whole.noise, whole.config
-    asked = before = GroundLevels.of(at.problem)
-    if at.ground_weights is not None:
-        asked = larger_levels(at.problem, at.grounds, at.ground_weights, at.values, config)
-    if asked != before:
+    asked = asked_levels(at)
+    if asked != GroundLevels.of(at.problem):
         noise = noise.with_ground_levels(asked)
         floors = whole.noise.floors, noise.floors
         grounds = with_floors(grounds, whole.trajectories, rough_extrinsics(at), *floors)

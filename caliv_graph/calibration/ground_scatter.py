@@ -21,6 +21,7 @@ from caliv_graph.calibration.ground import (
 )
 from caliv_graph.calibration.ground_factors import height_over
 from caliv_graph.calibration.problem import Problem
+from caliv_graph.calibration.solve import SolveState
 from caliv_graph.config.model import Config
 from caliv_graph.conventions import key_ground, key_height, key_vehicle
 from caliv_graph.products import Array, GroundObservation
@@ -108,6 +109,15 @@ def failed_sentence(what: str) -> str:
         f"failed: {what.rstrip('.')}. The result is that of the solve before, which "
         "may be off by more than its sigmas: better initial guesses "
         "(lidars.<name>.initial) and more scans lead to one that needs no other"
+    )
+
+
+def asked_levels(state: SolveState) -> GroundLevels:
+    """`larger_levels` of a solved graph; those that it has, where it has no ground."""
+    if state.ground_weights is None:
+        return GroundLevels.of(state.problem)
+    return larger_levels(
+        state.problem, state.grounds, state.ground_weights, state.values, state.config
     )
 
 

@@ -19,8 +19,8 @@ from caliv_graph.calibration.ground_floors import with_floors
 from caliv_graph.calibration.ground_scatter import (
     FURTHER_SOLVES,
     GroundLevels,
+    asked_levels,
     failed_sentence,
-    larger_levels,
     scattering_more,
     unsettled_sentence,
 )
@@ -88,7 +88,7 @@ class StructureSolve:
         converged: whether the last step was small.
         noise: heave and waves of the ground.
         times_s: seconds per stage.
-        failed: error of another solve that this one asked for; None: there is none.
+        left: a warning, if this one asked for another solve that failed or was one too many.
     """
 
     state: SolveState
@@ -99,18 +99,15 @@ class StructureSolve:
     converged: bool
     noise: SensorNoise
     times_s: dict[str, float]
-    failed: str | None = None
+    left: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Of time offsets that stay undetermined, of the structure, and of the ground."""
         offsets = undetermined_offset_sentences(self.offsets_s, OFFSET_DETERMINED_S)
         of_terms = (line for term in self.state.structure for line in term.warnings)
-        levels, asked = GroundLevels.of(self.state.problem), _levels_at(self)
-        left = () if asked == levels else (unsettled_sentence(scattering_more(levels, asked)),)
-        if self.failed is not None:
-            left = (failed_sentence(self.failed),)
-        return (*offsets, *of_terms, *left, *levels.beyond_ground)
+        levels = GroundLevels.of(self.state.problem)
+        return (*offsets, *of_terms, *self.left, *levels.beyond_ground)
 
 
 def solve_structure_and_ground(
@@ -165,33 +162,24 @@ def solve_structure_and_ground(
     times: dict[str, float] = {}
     terms = terms_at(noise.heave_m)
     solved = _solved(trajectories, config, progress, grounds, terms, noise, pose_noise, times)
-    for _ in range(FURTHER_SOLVES):
-        asked = _levels_at(solved)
-        if asked == GroundLevels.of(solved.state.problem):
+    for number in range(FURTHER_SOLVES + 1):
+        levels, asked = GroundLevels.of(solved.state.problem), asked_levels(solved.state)
+        if asked == levels:
             break
+        if number == FURTHER_SOLVES:
+            return replace(solved, left=(unsettled_sentence(scattering_more(levels, asked)),))
         before, noise = noise, noise.with_ground_levels(asked)
         # About the guesses: planes that scatter may have led far from them.
         grounds = with_floors(grounds, trajectories, start, before.floors, noise.floors)
         try:
             if noise.heave_m != before.heave_m:
                 terms = terms_at(noise.heave_m)
-            again = _solved(
+            solved = _solved(
                 trajectories, config, progress, grounds, terms, noise, pose_noise, times
             )
         except (SolveError, TargetError) as error:
-            return replace(solved, failed=error.what)
-        solved = again
+            return replace(solved, left=(failed_sentence(error.what),))
     return solved
-
-
-def _levels_at(solved: StructureSolve) -> GroundLevels:
-    """The levels of the ground that a solution asks for."""
-    state = solved.state
-    if state.ground_weights is None:
-        return GroundLevels.of(state.problem)
-    return larger_levels(
-        state.problem, state.grounds, state.ground_weights, state.values, state.config
-    )
 
 
 def _solved(

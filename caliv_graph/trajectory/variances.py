@@ -174,9 +174,10 @@ def estimated_scales(
         free_components(data),
         columns,
     )
-    if data.wheels is not None:
-        return contradicted(likelihood, {})
-    return contradicted(likelihood, levels_of_samples(data.inertial, data.noise, int(nodes[-1])))
+    shown = {}
+    if data.wheels is None:
+        shown = levels_of_samples(data.inertial, data.noise, int(nodes[-1]))
+    return contradicted(likelihood, shown)
 
 
 @dataclass

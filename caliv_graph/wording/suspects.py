@@ -48,14 +48,9 @@ def _or_axle(arm: Suspect) -> str:
     )
 
 
-MOVED_SIGMAS = 4.0
-"""An input that comes out farther from what is stated, in its own sigmas, is told of: one sound
-coordinate of 16,000."""
-
-
 def moved_sentence(sigmas: Mapping[str, float]) -> str:
     """Inputs that come out far from what is stated; otherwise empty. `sigmas` by their names."""
-    moved = {name: of for name, of in sigmas.items() if of > MOVED_SIGMAS}
+    moved = {name: of for name, of in sigmas.items() if of > DOUBT_SIGMAS}
     if not moved:
         return ""
     inputs = " and ".join(f"{name} ({of:.1f} sigma)" for name, of in moved.items())

@@ -122,7 +122,7 @@ def test_a_result_that_never_settles_is_said(monkeypatch: pytest.MonkeyPatch) ->
     def louder(*_: Any) -> GroundLevels:
         return GroundLevels(float(next(levels)), 0.002, 0.005)
 
-    monkeypatch.setattr(no_target, "larger_levels", louder)
+    monkeypatch.setattr(no_target, "asked_levels", louder)
 
     found, _ = solved(monkeypatch, 0.0, config_of(*LIDARS))
 

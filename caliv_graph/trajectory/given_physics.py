@@ -194,7 +194,10 @@ def stance(R_map_vehicle: Array, t_map_vehicle: Array) -> Stance:
     ahead = R_map_vehicle[at, :, 0][:-1] + R_map_vehicle[at, :, 0][1:]
     off = (moved[:, 0] + 1j * moved[:, 1]) * (ahead[:, 0] - 1j * ahead[:, 1])
     unit = off / np.maximum(np.abs(off), 1e-12)
-    # Doubled angles: a vehicle that reverses for a while follows its heading backwards.
+    # Doubled angles: a vehicle that reverses for a while follows its heading backwards. Of one that
+    # goes back as far as it went ahead the mean of the angles themselves is left to chance.
     mean = (unit**2).mean()
     around = 0.5 * np.abs(np.angle(unit**2 * np.conj(mean)))
-    return Stance(tilt, float(np.median(around)), float(np.angle(unit.mean())))
+    axis = np.exp(0.5j * np.angle(mean))
+    along = 1.0 if (unit * np.conj(axis)).real.sum() >= 0.0 else -1.0
+    return Stance(tilt, float(np.median(around)), float(np.angle(along * axis)))

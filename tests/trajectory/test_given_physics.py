@@ -91,6 +91,14 @@ def test_a_vehicle_that_reverses_or_goes_sideways_is_no_other_convention() -> No
         assert found(R @ Rotation.from_euler("z", turn, degrees=True).as_matrix(), t) is None
 
 
+@pytest.mark.parametrize("back", [0.6, 0.9, 1.0])
+def test_a_vehicle_that_goes_back_as_far_as_ahead_is_no_other_convention(back: float) -> None:
+    R, t = s_curve(ahead_m=1.0)
+    returning = slice(None, -1 - round(back * (len(t) - 1)), -1)
+    R, t = np.concatenate([R, R[returning]]), np.concatenate([t, t[returning]])
+    assert found(R, t + np.random.default_rng(2).normal(scale=0.01, size=t.shape)) is None
+
+
 def test_noisy_poses_are_no_other_convention() -> None:
     R, t = s_curve()
     assert found(R, t + np.random.default_rng(1).normal(scale=0.1, size=t.shape)) is None

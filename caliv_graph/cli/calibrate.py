@@ -69,7 +69,7 @@ def calibrate(
     check_guesses(settings, config)
     earlier = None if prior is None else read_calibration(prior)
     # Checked before the calibration, which takes long.
-    check_output_folder(out, FILES_OF_BOTH_RUNS, force)
+    check_output_folder(out, FILES_OF_BOTH_RUNS, force, [prior])
     recordings = open_recordings(settings, data or ())
     with streams.progress_on_stdout(as_json) as progress:
         job = run_job(recordings, settings, progress, earlier)

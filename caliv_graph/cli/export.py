@@ -135,7 +135,9 @@ def export(
     from caliv_graph.export.prepare import Options, prepare
     from caliv_graph.export.text import caveats
 
-    check_output_file(out, force)
+    # Not the base: to replace its numbers is what is asked for then.
+    inputs = [calibration, config, bag]
+    check_output_file(out, force, inputs)
     options = Options(
         consumer=to,
         out=out,
@@ -154,7 +156,7 @@ def export(
     request = prepare(calibration, options)
     exported = export_to(to, request)
     for path in exported.beside:
-        check_output_file(path, force)
+        check_output_file(path, force, inputs)
     for path, content in {**exported.beside, out: exported.content}.items():
         atomic_write(path, content, force)
     exported_lidars = dict.fromkeys(transform.lidar for transform in exported.transforms)

@@ -41,7 +41,7 @@ def init(
     from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.workflows.draft import draft_config
 
-    check_output_file(out, force)
+    check_output_file(out, force, [data, urdf])
     draft = draft_config(data, out, urdf)
     atomic_write(out, draft.text, force)
     streams.say(f"{out} written. LiDARs: {', '.join(draft.lidars)}")

@@ -47,7 +47,7 @@ def merge(
     if len(calibrations) < 2:
         raise ConfigError(f"{calibrations[0]}: is one calibration. Give two or more")
     each_once(calibrations, "", "a calibration")
-    check_output_file(out, force)
+    check_output_file(out, force, calibrations)
     merger = merge_calibrations({str(p): read_calibration(p) for p in calibrations}, p_value)
     write_calibration(merger.calibration, out, force)
     if as_json:

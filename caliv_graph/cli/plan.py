@@ -103,7 +103,7 @@ def plan(
 
     goals = parse_goals(sigma or ())
     if out is not None:
-        check_output_file(out, force)
+        check_output_file(out, force, [*drives, *(data or ())])
     configs = [path for path in drives if is_recording_config(path)]
     scenarios = [path for path in drives if path not in configs]
     if configs:

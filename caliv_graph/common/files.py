@@ -41,11 +41,14 @@ def atomic_write(path: Path, content: str | bytes, force: bool = False) -> None:
                 scratch.unlink(missing_ok=True)
 
 
-def check_output_file(path: Path, force: bool = False) -> None:
-    """Checks before long work what `atomic_write` checks after it.
+def check_output_file(path: Path, force: bool = False, inputs: Sequence[Path | None] = ()) -> None:
+    """Checks before long work what `atomic_write` checks after it, and that no input is lost.
+
+    `inputs` are files and folders that the command reads; None stands for one that is not given.
 
     Raises:
-        OutputError: the file exists and `force` is not set, or it cannot be written.
+        OutputError: the file exists and `force` is not set, it is an input or a file in one, or it
+            cannot be written.
     """
     with _errors_named(path):
         target = _resolved(path)
@@ -53,6 +56,13 @@ def check_output_file(path: Path, force: bool = False) -> None:
             raise OutputError(f"{path}: is a folder. Give the name of a file")
         if target.exists() and not force:
             raise OutputError(f"{path}: exists already. Give --force to replace it")
+        if target.exists():
+            for given, own in _all_resolved(inputs):
+                if target.is_relative_to(own):
+                    raise OutputError(
+                        f"{path}: is not replaced, for it is {_input_in(given, target == own)}. "
+                        "Give another name"
+                    )
         _check_parent_writable(path, target)
 
 
@@ -96,11 +106,15 @@ def output_folder(path: Path, content: Sequence[str], force: bool = False) -> It
                 shutil.rmtree(scratch, ignore_errors=True)
 
 
-def check_output_folder(path: Path, content: Sequence[str], force: bool = False) -> None:
-    """Checks before long work what `output_folder` checks after it.
+def check_output_folder(
+    path: Path, content: Sequence[str], force: bool = False, inputs: Sequence[Path | None] = ()
+) -> None:
+    """Checks before long work what `output_folder` checks after it, and that no input is lost.
+
+    `inputs` are files that the command reads; None stands for one that is not given.
 
     Raises:
-        OutputError: `path` exists and is not to be replaced, or cannot be written.
+        OutputError: `path` exists and is not to be replaced, holds an input, or cannot be written.
     """
     with _errors_named(path):
         target = _resolved(path)
@@ -122,6 +136,12 @@ def check_output_folder(path: Path, content: Sequence[str], force: bool = False)
             raise OutputError(
                 f"{path}: exists already. Give --force to replace it, or another --out"
             )
+        for given, own in _all_resolved(inputs):
+            if own.is_relative_to(target):
+                raise OutputError(
+                    f"{path}: is not replaced, for it holds {given}, which this command reads. "
+                    "Give another --out"
+                )
         if not fnmatch.filter(names, content[0]):
             raise OutputError(
                 f"{path}: is not replaced: it holds no {content[0]} and is not a result of this "
@@ -137,6 +157,16 @@ def check_output_folder(path: Path, content: Sequence[str], force: bool = False)
                 f"{path}: is not replaced, for it also holds '{foreign[0]}', which is not part of "
                 "a result and would be lost. Move it elsewhere, or give another --out"
             )
+
+
+def _all_resolved(inputs: Sequence[Path | None]) -> list[tuple[Path, Path]]:
+    """Each input that is given, and where it is."""
+    return [(given, _resolved(given)) for given in inputs if given is not None]
+
+
+def _input_in(given: Path, whole: bool) -> str:
+    """What a file is that is an input as a `whole`, or else part of one."""
+    return "what this command reads" if whole else f"part of {given}, which this command reads"
 
 
 def _belongs(entry: Path, folder: Path, content: Sequence[str]) -> bool:

@@ -200,6 +200,22 @@ def test_an_earlier_calibration_that_is_not_there(pipeline: Pipeline, config: Pa
     assert not (config.parent / "out").exists()
 
 
+def test_the_earlier_calibration_is_not_replaced_by_the_result(
+    pipeline: Pipeline, config: Path
+) -> None:
+    out = config.parent / "out"
+    calibrate(config, "--out", out)
+    before = (out / "calibration.yaml").read_bytes()
+    pipeline.config = None
+
+    refused = calibrate(config, "--prior", out / "calibration.yaml", "--out", out, "--force")
+
+    assert isinstance(refused.exception, OutputError)
+    assert "which this command reads" in str(refused.exception)
+    assert pipeline.config is None, "said only after the work"
+    assert (out / "calibration.yaml").read_bytes() == before
+
+
 def test_an_older_result_is_replaced_only_with_force(pipeline: Pipeline, config: Path) -> None:
     out = config.parent / "out"
     calibrate(config, "--out", out)

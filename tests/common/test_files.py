@@ -347,3 +347,28 @@ def test_links_in_a_circle_and_files_on_the_way(tmp_path: Path) -> None:
             check(Path("/proc/result"))
         check(tmp_path / "new" / "result")
     assert names(tmp_path) == ["file", "loop"]
+
+
+def test_force_replaces_no_input(tmp_path: Path) -> None:
+    drive, config = tmp_path / "drive", tmp_path / "config.yaml"
+    bag = drive / "drive.mcap"
+    drive.mkdir()
+    for file in (bag, config):
+        file.write_text("mine")
+    (tmp_path / "link").symlink_to(bag)
+    inputs = [drive, None, config]
+
+    for out in (bag, tmp_path / "link"):
+        with pytest.raises(OutputError, match=r"it is part of .*drive, which this command reads"):
+            check_output_file(out, True, inputs)
+    with pytest.raises(OutputError, match=r"it is what this command reads. Give another name"):
+        check_output_file(config, True, inputs)
+    # What is not there cannot be lost: a config may lie beside the clouds that it is of.
+    check_output_file(drive / "config.yaml", False, inputs)
+
+
+def test_a_result_that_is_read_is_not_replaced(tmp_path: Path, result: Path) -> None:
+    earlier = result / "calibration.yaml"
+    with pytest.raises(OutputError, match=r"holds .*calibration.yaml, which this command reads"):
+        check_output_folder(result, CONTENT, True, [None, earlier])
+    check_output_folder(result, CONTENT, True, [tmp_path / "elsewhere.yaml"])

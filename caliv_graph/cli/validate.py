@@ -37,7 +37,8 @@ def validate(
         bool,
         typer.Option(
             "--repeat/--no-repeat",
-            help="Also calibrate the two halves of the drive and compare them.",
+            help="Also calibrate the two halves of the drive and compare them. Where walls are "
+            "missing, nothing else tests x, y and yaw.",
         ),
     ] = True,
     p_value: PValue = P_VALUE,

@@ -238,6 +238,8 @@ class Verdict:
         contradicts: whether the p-value, or one of the held-out strips, is beyond 5 sigma.
         sentences: the verdict in words.
         reason: the sentence that says why it contradicts; empty if it does not.
+        only_level: whether it is `unclear` only since all that was tested is level, which tests
+            neither x and y nor yaw.
     """
 
     word: Word
@@ -250,6 +252,7 @@ class Verdict:
     contradicts: bool
     sentences: tuple[str, ...]
     reason: str = ""
+    only_level: bool = False
 
     def also(self, sentences: Sequence[str], contradicts: bool = False) -> Verdict:
         """The verdict with the sentences of another test; if that contradicts, no better word."""

@@ -138,7 +138,8 @@ def with_held_out(verdict: Verdict, held: HeldOutStructure, before: str) -> Verd
     values = {stage: 1e3 * held.distance_m[stage] for stage in (BEFORE, AFTER)}
     better = values[BEFORE] / values[AFTER] if values[AFTER] > 0.0 else None
     sentences = [held_out_sentence(len(held.tested), values[BEFORE], values[AFTER], before)]
-    if all(abs(strip.normal_map[2]) > LEVEL for strip in held.tested):
+    level = all(abs(strip.normal_map[2]) > LEVEL for strip in held.tested)
+    if level:
         sentences.append(level_sentence())
     contradicting = []
     for stage in (AFTER, WITHOUT):
@@ -158,9 +159,12 @@ def with_held_out(verdict: Verdict, held: HeldOutStructure, before: str) -> Verd
         words_of_both.append(verdict.word)
     # Without walls, poles and objects there was nothing to say before.
     said = verdict.sentences if verdict.better is not None else ()
+    word = max(words_of_both, key=_SEVERITY.index)
+    only_level = level and verdict.p_value is None and word == "good"
     found = replace(
         verdict,
-        word=max(words_of_both, key=_SEVERITY.index),
+        word="unclear" if only_level else word,
+        only_level=only_level,
         contradicts=verdict.contradicts or bool(contradicting),
         sentences=(*said, *sentences),
         reason=verdict.reason or next(iter(contradicting), ""),

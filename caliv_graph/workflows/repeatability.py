@@ -185,7 +185,10 @@ def with_halves(found: Validation, calibration: Calibration, repeated: Repeatabi
     if elsewhere:
         return replace(found, verdict=found.verdict.also(elsewhere, contradicts=True))
     if alike:
-        return replace(found, verdict=found.verdict.also((alike_sentence(alike),)))
+        verdict = found.verdict.also((alike_sentence(alike),))
+        # What level structure does not test, they do.
+        word = "good" if verdict.only_level else verdict.word
+        return replace(found, verdict=replace(verdict, word=word, only_level=False))
     return found
 
 

@@ -152,6 +152,27 @@ def test_the_worse_word_counts(
     assert ("do not explain" in found.reason) == found.contradicts
 
 
+@pytest.mark.parametrize(
+    ("wall", "walls", "p", "word"),
+    [
+        (False, None, 0.4, "unclear"),
+        (True, None, 0.4, "good"),
+        (False, 0.3, 0.4, "good"),  # these tell x, y and yaw
+        (False, None, 1e-9, "contradicted"),
+    ],
+)
+def test_level_strips_alone_make_nothing_good(
+    wall: bool, walls: float | None, p: float, word: str
+) -> None:
+    held, up = held_out(p=(p, 0.5)), np.array([0.0, 0.0, 1.0])
+    first, second, unshared = held.strips
+    second = second if wall else replace(second, normal_map=up)
+    strips = (replace(first, normal_map=up), second, unshared)
+    found = with_held_out(verdict(walls), replace(held, strips=strips), GUESSES)
+    assert found.word == word
+    assert found.only_level == (word == "unclear")
+
+
 def test_strips_that_no_two_lidars_see_change_no_verdict() -> None:
     held = replace(held_out(), strips=(held_strip(1, 0.0, shared=False),))
     found = with_held_out(verdict(), held, GUESSES)

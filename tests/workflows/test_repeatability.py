@@ -88,6 +88,10 @@ def test_halves_of_a_drive_agree() -> None:
     right = with_halves(VALIDATION, file, found).verdict
     assert (right.word, right.contradicts) == ("good", False)
     assert "agrees with that of this drive by every other scan (p " in right.sentences[-1]
+    # It tells what level structure leaves open, but no more than that.
+    for only_level, word in ((True, "good"), (False, "unclear")):
+        before = replace(VALIDATION.verdict, word="unclear", only_level=only_level)
+        assert with_halves(replace(VALIDATION, verdict=before), file, found).verdict.word == word
     front = file.lidars["front"]
     aside = front.T_vehicle_lidar.translation() + np.array([0.0, 0.1, 0.0])
     moved = gtsam.Pose3(front.T_vehicle_lidar.rotation(), aside)

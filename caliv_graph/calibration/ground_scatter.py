@@ -73,10 +73,10 @@ class GroundLevels:
         if not any(map(operator.eq, astuple(self), astuple(MOST))):
             return ()
         return (
-            f"planes of the ground, or heights of the vehicle above it, scatter by {self.text}, "
-            f"and more than {MOST.text} is not taken for ground: roll, pitch and z have little of "
-            "it. Look for ground that is none (a ramp, a kerb, a load in view, vegetation), and "
-            "for a vehicle height (ground.vehicle_height) that is wrong",
+            "planes of the ground and heights of the vehicle above it scatter too much for "
+            f"ground, as by {self.text}; at most {MOST.text} are taken for ground. Roll, pitch and "
+            "z have little of it. Look for ground that is none (a ramp, a kerb, a load in view, "
+            "vegetation), and for a vehicle height (ground.vehicle_height) that is wrong",
         )
 
 

@@ -44,6 +44,13 @@ _RECOVERY = {
     ".db3": "Recover it with 'sqlite3 FILE .recover', or record the drive again",
 }
 
+_BEGINNINGS = {
+    ".mcap": ("an MCAP file", b"\x89MCAP0\r\n"),
+    ".bag": ("a bag of ROS 1", b"#ROSBAG V"),
+    ".db3": ("an SQLite database", b"SQLite format 3\x00"),
+}
+"""What a file of each suffix is, and what it begins with."""
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -267,6 +274,8 @@ class Bag:
         except OSError as e:
             raise RecordingError(f"{file}: {unreadable(e)}") from None
         except Exception as e:  # struct.error, KeyError, MemoryError of a size gone wrong, ...
+            if other := _of_another_kind(Path(file)):
+                raise RecordingError(f"{file}: {other}") from None
             said = " ".join(str(e).split()).rstrip(".") or type(e).__name__
             advice = _RECOVERY.get(Path(file).suffix, "Record the drive again, or recover the bag")
             if "empty" in said:
@@ -277,6 +286,17 @@ class Bag:
                 f"{file}: the bag is cut off, damaged or of an unsupported kind "
                 f"({type(e).__name__}: {said}). {advice}"
             ) from None
+
+
+def _of_another_kind(file: Path) -> str | None:
+    """What is wrong with a file that never was what its suffix says; None: it may have been."""
+    what, begins_with = _BEGINNINGS.get(file.suffix, ("", b""))
+    with suppress(OSError), file.open("rb") as opened:
+        begins = opened.read(len(begins_with))
+        # A file may be cut off there, or hold zeros where a recorder was stopped.
+        if begins.strip(b"\x00") and not begins_with.startswith(begins):
+            return f"is not {what}: it begins with {begins!r}. Give the recording's own file"
+    return None
 
 
 def _close(readers: list[_Reader]) -> None:

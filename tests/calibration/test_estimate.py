@@ -91,4 +91,4 @@ def test_levels_that_no_ground_has_are_a_warning() -> None:
 
     assert usual.beyond_ground == ()
     (said,) = replace(usual, distance_m=MOST.distance_m).beyond_ground
-    assert "scatter by 1 mrad and 200 mm of waves, 10 mm of heave" in said
+    assert "scatter too much for ground, as by 1 mrad and 200 mm of waves, 10 mm of heave" in said

@@ -83,7 +83,7 @@ def test_hills_are_waves_of_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_ground_of_a_mistake_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     steep, _ = solved(monkeypatch, 0.2, config_of(*LIDARS))
 
-    assert any("is not taken for ground" in line for line in steep.warnings)
+    assert any("scatter too much for ground" in line for line in steep.warnings)
 
 
 def test_waves_that_the_config_states_are_held(monkeypatch: pytest.MonkeyPatch) -> None:

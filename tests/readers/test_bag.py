@@ -144,6 +144,20 @@ def test_a_bag_that_is_cut_off(tmp_path: Path, kind: str, part: float) -> None:
     assert "ecord" in str(caught.value)  # or recover
 
 
+@pytest.mark.parametrize("suffix", [".mcap", ".bag", ".db3"])
+@pytest.mark.parametrize("content", [b"data:\n  path: drive\n", b"\xff\x00\x01", b"x"])
+def test_a_file_of_another_kind_is_not_called_damaged(
+    tmp_path: Path, suffix: str, content: bytes
+) -> None:
+    file = tmp_path / f"drive{suffix}"
+    file.write_bytes(content)
+    with pytest.raises(RecordingError) as caught:
+        Bag(file)
+    assert f"{file}: is not a" in str(caught.value)
+    assert "it begins with b" in str(caught.value)
+    assert "recover" not in str(caught.value)
+
+
 def test_damage_in_the_middle_is_told_when_it_is_come_upon(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "drive", messages(), "mcap-zstd")
     file = file_of(path)

@@ -1,4 +1,7 @@
-"""From a bag to a localiser that carries the calibration; `# %%` are cells for editors."""
+"""From a bag to a localiser that carries the calibration; `# %%` are cells for editors.
+
+Run it in the folder of the checkout: its paths begin there.
+"""
 
 # %% A drive: your bag in out/walkthrough/drive, or a simulated one, 18 MB
 from pathlib import Path

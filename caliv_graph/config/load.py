@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -71,13 +72,19 @@ def validated(model: type[Model], raw: Any, source: str, expected: str, remedy: 
 def parse_config(raw: Any, source: str, base: Path) -> Config:
     """Validates the configuration that a YAML file held; its paths are relative to `base`.
 
+    `~` at the beginning of a path is the home folder, as in a shell.
+
     Raises:
         ConfigError: with the first problem, in one line.
     """
     expected = "configuration: expected keys such as 'lidars'"
     config = validated(Config, raw, source, expected)
     named = {"path": config.data.path, "poses": config.data.poses}
-    paths = {key: (base / path).absolute() for key, path in named.items() if path is not None}
+    paths = {
+        key: (base / os.path.expanduser(path)).absolute()  # `Path` fails where there is no home
+        for key, path in named.items()
+        if path is not None
+    }
     return config.model_copy(update={"data": config.data.model_copy(update=paths)})
 
 

@@ -179,7 +179,8 @@ def slip_finding(drive: str, slip: MountSlip) -> Finding | None:
         sentence = (
             f"{drive}: the mount of lidar {who} {verb} about {when}, {by}: {size}. {between}. "
             f"Fasten the mount{', and those of IMU and antenna,' if slip.alone else ''} and "
-            f"{_RECORD_AGAIN}"
+            f"{_RECORD_AGAIN}. A cab or a rack on springs that leans in curves looks the same, and "
+            "no part is right then: fix it to the frame, or drive more slowly"
         )
     severity: Literal["contradiction", "warning"] = "contradiction" if contradiction else "warning"
     # No suspect of the ranking: what a target says of the mount of one LiDAR is another value.

@@ -506,3 +506,13 @@ def test_an_unknown_rotation_is_no_pose() -> None:
     config = ImuConfig.model_validate({"T_vehicle_imu": {"xyz": [0, 0, 0], "rpy_deg": None}})
     with pytest.raises(ConfigError, match="the rotation of the IMU is unknown"):
         config.T_vehicle_imu.pose()
+
+
+def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "me"))
+    named = {"path": "~/drive", "poses": "~nobody-here/poses.txt"}
+    raw = {"data": named, "lidars": {"a": {"topic": "/a"}}}
+    data = parse_config(raw, "config.yaml", tmp_path / "configs").data
+    assert data.path == tmp_path / "me" / "drive"
+    # No such person: the path as it stands.
+    assert data.poses == tmp_path / "configs" / "~nobody-here" / "poses.txt"

@@ -16,11 +16,18 @@ def symmetry_sentence(symmetry: Symmetry, name: str, sigma_rad: float) -> str:
     compared = ""
     if len(symmetry.unseen):
         compared = f" ({100.0 * symmetry.compared:.0f}% of it could be compared)"
-    if symmetry.continuous:
+    if symmetry.continuous and symmetry.upright:
         return (
             f"{name}: it looks the same after any turn about {about}{compared}: its clouds do not "
             "determine the rotation of a LiDAR about that axis. Drive around it, or use a target "
             "with corners, such as a chair"
+        )
+    if symmetry.continuous:
+        # Also of a chair of which little more than its back is seen: it is not marginalised.
+        return (
+            f"{name}: what was seen of it looks nearly the same after any turn about {about}"
+            f"{compared}: its clouds tell little of the rotation of a LiDAR about that axis. Drive "
+            "around it, nearer if it has few points, or use a target with corners on all sides"
         )
     turn = math.degrees(symmetry.angle_rad)
     # Registration converges to the nearer of two solutions.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,6 +33,14 @@ def test_a_drum_leaves_a_rotation_undetermined() -> None:
         "around it, or use a target with corners, such as a chair"
     )
     assert "compared" not in symmetry_sentence(upright(0.0), "target", SIGMA)
+
+
+def test_a_chair_s_back_is_not_told_to_be_a_chair() -> None:
+    across = replace(upright(0.0), axis_target=np.array([1.0, 0.0, 0.0]))
+    text = symmetry_sentence(across, "target", SIGMA)
+    assert "what was seen of it looks nearly the same after any turn about a level axis" in text
+    assert "tell little of the rotation" in text
+    assert "chair" not in text
 
 
 def test_a_cube_is_no_danger_to_good_guesses() -> None:

@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from caliv_graph.calibration import refine
+from caliv_graph.calibration.reduced import Reduced
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.lidars import PoseSigmaConfig
 from caliv_graph.config.load import load_config
@@ -499,6 +500,44 @@ def test_the_joint_loop_has_one_end(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert len(usual.run.solution.course) < len(course) < refine.REFINEMENTS
     assert course[-1].sigmas < 0.05
     assert apart(usual, further) < 0.3
+
+
+def test_a_motion_that_clouds_do_not_hold_is_in_the_sigmas(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loops = list[refine._Loop]()
+    at_the_end = refine._Loop.at_the_end
+
+    def kept(loop: refine._Loop) -> tuple[refine._Shapes, Reduced]:
+        loops.append(loop)
+        return at_the_end(loop)
+
+    monkeypatch.setattr(refine._Loop, "at_the_end", kept)
+    drive = simulated(paper_scenario(rate_hz=1.25), 2, tmp_path / "drive")
+    try_out(drive.asked(registration=COARSE))
+    (loop,) = loops
+    of = loop.expected()
+    reduced = loop.linearised(*of)
+    information = reduced.D + loop.prior
+    rear_x = np.eye(12)[9]
+    step = rear_x / np.sqrt(rear_x @ information @ rear_x)
+    monkeypatch.setattr(refine, "_way_of", lambda _: 3.0 * step)
+
+    # A chair that both LiDARs see whole holds what its clouds claim.
+    assert loop._loose_motion(*of, reduced) is None
+
+    pulls = iter([np.zeros(12), -0.3 * information @ step + loop.prior @ step])
+    monkeypatch.setattr(refine._Loop, "_pull_of_shapes", lambda *_: next(pulls))
+    found = loop._loose_motion(*of, reduced)
+
+    assert found is not None
+    left = loop.linearised(*of).D + loop.prior
+    assert step @ left @ step == pytest.approx(0.3, abs=0.01)
+    across = np.eye(12)[10] - (information @ step)[10] * step
+    assert across @ left @ across == pytest.approx(across @ information @ across, rel=0.05)
+    # A way that is short is none, whatever clouds hold.
+    monkeypatch.setattr(refine, "_way_of", lambda _: 0.5 * step)
+    assert loop._loose_motion(*of, reduced) is None
 
 
 def test_where_surfels_are_few_the_end_is_the_mean_of_several(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -94,6 +95,18 @@ WAY, LONG_WAY_SIGMAS = 10, 2.5
 """Likewise where the extrinsics have come so far in as many iterations. Steps of 0.4 that lead
 nowhere come 1.3, those of one direction 4: of `random` 272, which fall by a fortieth each time,
 eighteen were still to come."""
+
+LOOSE_WAY_SIGMAS, MOSTLY_HELD = 0.7, 0.8
+"""How far the extrinsics have come in the last `WAY` iterations, in joint standard deviations, from
+which what the clouds hold along this way is measured; and the part of what all data claim there
+that passes for all of it. Steps that lead nowhere come as far, and are held by 0.97."""
+
+FOLLOWING = 3
+"""Iterations in which shapes follow a motion of the clouds: eight find the same."""
+
+LOOSE_SIGMAS, HALVINGS = (0.05, 20.0), 10
+"""Size of such a motion in its claimed standard deviations, and halvings of the interval in which
+it is looked for."""
 
 MOST_ROUNDS = 8
 """Rounds of iterations of such a loop at most: shapes that begin anew are coarse at first, and move
@@ -278,7 +291,8 @@ class _Loop:
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
     once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement since the
     shapes began; `channels` that see the targets, and sizes of their errors; `ends`: the extrinsics
-    after each iteration since then.
+    after each iteration since then; `loose`: motion of the clouds that
+    they do not tell, at the end.
     """
 
     state: SolveState
@@ -292,6 +306,7 @@ class _Loop:
     fine: int = 0
     ranges: tuple[OwnRanges, ...] = ()
     ends: list[list[gtsam.Pose3]] = field(default_factory=list)
+    loose: Array | None = None
 
     def expected(self) -> tuple[_Shapes, CloudLinearisation]:
         """E-step at the poses that the graph predicts, and the derivatives of these."""
@@ -306,6 +321,9 @@ class _Loop:
         self.state.least_scale = self.left_out(lines)
         self.estimate_scale(shapes, lines)
         reduced = self.linearised(shapes, lines)
+        self.loose = self._loose_motion(shapes, lines, reduced)
+        if self.loose is not None:
+            reduced = self.linearised(shapes, lines)
         self.state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced
 
@@ -393,10 +411,15 @@ class _Loop:
         return replace(sizes, offset_m=min(sizes.offset_m, most_m))
 
     def directions(self, shapes: _Shapes, lines: CloudLinearisation) -> Array:
-        """(6 J, B) by biases of ranges, by channels, and by turns of the gyroscope since stamps."""
+        """(6 J, B) by biases of ranges, by channels, and by turns of the gyroscope since stamps.
+
+        And the motion that the clouds do not tell, once it is known.
+        """
         biases = shapes.biases.directions(self._sizes())
         channels = self.channels.directions(self.states, shapes.poses, self.channel_sizes)
-        return np.hstack([biases, channels, turned_clouds(self.state.problem, lines)])
+        turned = turned_clouds(self.state.problem, lines)
+        loose = [] if self.loose is None else [self.loose]
+        return np.hstack([biases, channels, turned, *loose])
 
     def _applied(self, directions: Array) -> Array:
         """(B,) the offsets in sigmas, of all biases along `directions`."""
@@ -442,11 +465,49 @@ class _Loop:
     def _way_sigmas(self, information: Array) -> float:
         """`Iteration.way_sigmas`, by an information (6n, 6n) on the extrinsics."""
         self.ends.append(self.extrinsics())
-        if len(self.ends) <= WAY:
-            return 0.0
-        ends = zip(self.ends[-1], self.ends[-1 - WAY], strict=True)
-        way = np.concatenate([vehicle_axes_difference(T, T0) for T, T0 in ends])
-        return float(np.sqrt(way @ information @ way))
+        way = _way_of(self.ends)
+        return 0.0 if way is None else float(np.sqrt(way @ information @ way))
+
+    def _loose_motion(
+        self, shapes: _Shapes, lines: CloudLinearisation, reduced: Reduced
+    ) -> Array | None:
+        """(6 J, 1) motion of the clouds, 1 sigma, that they do not tell; None: none is found.
+
+        What the clouds hold along the way that the loop has come is measured: by the force that is
+        left once the shapes have followed a motion by 1 sigma.
+        """
+        way, information = _way_of(self.ends), reduced.D + self.prior
+        if way is None or way @ information @ way < LOOSE_WAY_SIGMAS**2:
+            return None
+        step = way / np.sqrt(way @ information @ way)
+        pulls = [self._pull_of_shapes(reduced.move(of)) for of in (0.0 * step, step)]
+        held = float(step @ (pulls[0] - pulls[1]) + step @ self.prior @ step)
+        if held > MOSTLY_HELD:
+            return None
+        motion = reduced.moved_clouds(step) - reduced.moved_clouds(0.0 * step)
+        low, high = np.log(LOOSE_SIGMAS)
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            self.loose = np.exp(middle) * motion[:, None]
+            left = step @ (self.linearised(shapes, lines).D + self.prior) @ step
+            low, high = (middle, high) if left > max(held, 0.0) else (low, middle)
+        return self.loose
+
+    def _pull_of_shapes(self, values: gtsam.Values) -> Array:
+        """(6n,) right-hand side `Reduced.c` at values that the shapes have followed."""
+        state, now = self.state, self.state.values
+        shapes = [copy(shape) for shape in self.states]
+        lines = linearise_clouds(state.problem, values)
+        poses = self.poses_of_clouds(lines)
+        for _ in range(FOLLOWING):
+            for shape, (R, t) in zip(shapes, poses, strict=True):
+                shape.expect(R, t)
+                shape.maximise(R, t)
+        state.values = values
+        try:
+            return self.linearised(_expect(shapes, poses, state.turns, self.ranges), lines).c
+        finally:
+            state.values = now
 
     def _step(self, reduced: Reduced, number: int) -> tuple[Array, int | None]:
         """The step (6n,) of the extrinsics; and in mode `auto` the undetermined directions."""
@@ -490,6 +551,14 @@ class _Loop:
             and (_is_small(last) or last.sigmas < STEP_SIGMAS)
             and last.weight_change < 10.0 * WEIGHT_TOLERANCE
         )
+
+
+def _way_of(ends: Sequence[Sequence[gtsam.Pose3]]) -> Array | None:
+    """(6n,) how far extrinsics have come in their last `WAY` iterations; None: too few."""
+    if len(ends) <= WAY:
+        return None
+    both = zip(ends[-1], ends[-1 - WAY], strict=True)
+    return np.concatenate([vehicle_axes_difference(T, T0) for T, T0 in both])
 
 
 def _expect(

@@ -163,6 +163,7 @@ def _extrinsics(calibration: Calibration) -> Table:
 
 def _suspects(calibration: Calibration) -> Table:
     table = new_table("input", "by (1 sigma)", "sigma", "with the first\nfreed")
+    table.columns[1].no_wrap = False  # of six numbers: names would be cut off for it
     for suspect in calibration.suspects[:MOST_SUSPECTS]:
         name, by, _, sigmas, left = suspect_row(suspect)
         table.add_row(Text(name), Text(by), Text(sigmas), Text(left))

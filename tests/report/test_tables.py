@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console, RenderableType
 
 from caliv_graph.common.progress import SilentProgress, StageRecord
-from caliv_graph.products import Guess
+from caliv_graph.products import Guess, Suspect
 from caliv_graph.report.figures.uncertainty import sigma_figure
 from caliv_graph.report.html import move_rows, verdicts
 from caliv_graph.report.inspection import (
@@ -285,3 +285,16 @@ def test_slow_errors_are_said_with_their_source() -> None:
     open_ = {"slow_errors": [{**level, "sigma": 0.0124, "from": "expected: LiDARs leave it open"}]}
     assert "GNSS horizontal 12 mm (expected: LiDARs leave it open)" in slow_errors_text(open_)
     assert slow_errors_text({}) == ""
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_names_of_suspects_are_whole(width: int) -> None:
+    """A place and its angles are six numbers with six sigmas, which take two lines."""
+    name = "lidars.front.mount.halves"
+    sigma = (0.02, 0.01, 0.01, 0.1, 0.1, 0.2)
+    value = (-0.12, 0.35, 0.01, -1.05, 0.62, 17.25)
+    suspect = Suspect(name, value, sigma, value, ("m",) * 3 + ("deg",) * 3, 0.93, 23.0, 23.0)
+    calibration = make_calibration(contradictions=("a",), suspects=(suspect,))
+    lines = rendered(calibration_table(calibration), width)
+    assert sum(line.startswith(name) for line in lines) == 1
+    assert "0.2) deg)" in " ".join(line.strip() for line in lines)

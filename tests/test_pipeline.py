@@ -519,25 +519,32 @@ def test_a_motion_that_clouds_do_not_hold_is_in_the_sigmas(
     of = loop.expected()
     reduced = loop.linearised(*of)
     information = reduced.D + loop.prior
-    rear_x = np.eye(12)[9]
-    step = rear_x / np.sqrt(rear_x @ information @ rear_x)
+    rear_z = np.eye(12)[11]
+    step = rear_z / np.sqrt(rear_z @ information @ rear_z)
     monkeypatch.setattr(refine, "_way_of", lambda _: 3.0 * step)
 
+    # Of its few iterations most were at coarse shapes.
+    assert loop.fine_since <= refine.WAY
+    assert not loop._find_loose(*of, reduced)
     # A chair that both LiDARs see whole holds what its clouds claim.
-    assert loop._loose_motion(*of, reduced) is None
+    loop.fine_since = refine.WAY + 1
+    assert not loop._find_loose(*of, reduced)
+    assert loop.loose is None
 
     pulls = iter([np.zeros(12), -0.3 * information @ step + loop.prior @ step])
     monkeypatch.setattr(refine._Loop, "_pull_of_shapes", lambda *_: next(pulls))
-    found = loop._loose_motion(*of, reduced)
+    assert loop._find_loose(*of, reduced)
 
-    assert found is not None
-    left = loop.linearised(*of).D + loop.prior
+    found = loop.linearised(*of)
+    left = found.D + loop.prior
     assert step @ left @ step == pytest.approx(0.3, abs=0.01)
     across = np.eye(12)[10] - (information @ step)[10] * step
     assert across @ left @ across == pytest.approx(across @ information @ across, rel=0.05)
+    # The clouds and the rest pull as they did: the estimate is where it was.
+    np.testing.assert_allclose(found.clouds[1], reduced.clouds[1], atol=1e-6 * information.max())
     # A way that is short is none, whatever clouds hold.
     monkeypatch.setattr(refine, "_way_of", lambda _: 0.5 * step)
-    assert loop._loose_motion(*of, reduced) is None
+    assert not loop._find_loose(*of, reduced)
 
 
 def test_where_surfels_are_few_the_end_is_the_mean_of_several(

@@ -96,7 +96,7 @@ WAY, LONG_WAY_SIGMAS = 10, 2.5
 nowhere come 1.3, those of one direction 4: of `random` 272, which fall by a fortieth each time,
 eighteen were still to come."""
 
-LOOSE_WAY_SIGMAS, MOSTLY_HELD = 0.7, 0.8
+LOOSE_WAY_SIGMAS, MOSTLY_HELD = 0.7, 0.7
 """How far the extrinsics have come in the last `WAY` iterations, in joint standard deviations, from
 which what the clouds hold along this way is measured; and the part of what all data claim there
 that passes for all of it. Steps that lead nowhere come as far, and are held by 0.97."""
@@ -291,8 +291,8 @@ class _Loop:
     the clouds are moved back before they meet the shape; `undetermined`: number of such directions
     once it is fixed; `fine`: iterations at the noise level; `ranges` of each placement since the
     shapes began; `channels` that see the targets, and sizes of their errors; `ends`: the extrinsics
-    after each iteration since then; `loose`: motion of the clouds that
-    they do not tell, at the end.
+    after each iteration since then; `fine_since`: as `fine`, of these shapes; `loose` (6 J, 1):
+    motion of the clouds that they do not tell, at the end, and how they pull along it.
     """
 
     state: SolveState
@@ -306,7 +306,9 @@ class _Loop:
     fine: int = 0
     ranges: tuple[OwnRanges, ...] = ()
     ends: list[list[gtsam.Pose3]] = field(default_factory=list)
+    fine_since: int = 0
     loose: Array | None = None
+    loose_pull: float = 0.0
 
     def expected(self) -> tuple[_Shapes, CloudLinearisation]:
         """E-step at the poses that the graph predicts, and the derivatives of these."""
@@ -321,8 +323,7 @@ class _Loop:
         self.state.least_scale = self.left_out(lines)
         self.estimate_scale(shapes, lines)
         reduced = self.linearised(shapes, lines)
-        self.loose = self._loose_motion(shapes, lines, reduced)
-        if self.loose is not None:
+        if self._find_loose(shapes, lines, reduced):
             reduced = self.linearised(shapes, lines)
         self.state.graph_seconds += time.perf_counter() - begun
         return shapes, reduced
@@ -359,7 +360,7 @@ class _Loop:
 
         The surfels are those of beams from now on. Another `draw` begins on other points.
         """
-        self.ends = []
+        self.ends, self.fine_since = [], 0
         _hand_weights(self.state, self.states)
         lines = linearise_clouds(self.state.problem, self.state.values)
         for shape, (R, t) in zip(self.states, self.poses_of_clouds(lines), strict=True):
@@ -425,6 +426,8 @@ class _Loop:
         """(B,) the offsets in sigmas, of all biases along `directions`."""
         out = np.zeros(directions.shape[1])
         out[: len(self.offsets_m)] = self.offsets_m / self._sizes().offset_m
+        if self.loose is not None:
+            out[-1] = self.loose_pull
         return out
 
     def _follow(self, shapes: _Shapes, reduced: Reduced, step: Array, directions: Array) -> None:
@@ -442,6 +445,7 @@ class _Loop:
             if self.fine % SCALED_EVERY == 0:
                 self.estimate_scale(shapes, lines)
             self.fine += 1
+            self.fine_since += 1
             if self.fine == BIAS_AFTER:
                 self.estimate_bias(shapes, lines)
         directions = self.directions(shapes, lines)
@@ -468,30 +472,33 @@ class _Loop:
         way = _way_of(self.ends)
         return 0.0 if way is None else float(np.sqrt(way @ information @ way))
 
-    def _loose_motion(
-        self, shapes: _Shapes, lines: CloudLinearisation, reduced: Reduced
-    ) -> Array | None:
-        """(6 J, 1) motion of the clouds, 1 sigma, that they do not tell; None: none is found.
+    def _find_loose(self, shapes: _Shapes, lines: CloudLinearisation, reduced: Reduced) -> bool:
+        """Whether there is a motion that the clouds do not tell, which is `loose` from then on.
 
         What the clouds hold along the way that the loop has come is measured: by the force that is
         left once the shapes have followed a motion by 1 sigma.
         """
         way, information = _way_of(self.ends), reduced.D + self.prior
-        if way is None or way @ information @ way < LOOSE_WAY_SIGMAS**2:
-            return None
+        # While shapes are coarse, all goes a long way.
+        if way is None or self.fine_since <= WAY:
+            return False
+        if way @ information @ way < LOOSE_WAY_SIGMAS**2:
+            return False
         step = way / np.sqrt(way @ information @ way)
         pulls = [self._pull_of_shapes(reduced.move(of)) for of in (0.0 * step, step)]
         held = float(step @ (pulls[0] - pulls[1]) + step @ self.prior @ step)
         if held > MOSTLY_HELD:
-            return None
+            return False
         motion = reduced.moved_clouds(step) - reduced.moved_clouds(0.0 * step)
         low, high = np.log(LOOSE_SIGMAS)
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
             self.loose = np.exp(middle) * motion[:, None]
+            # The clouds pull as they did: at the end of EM their gradient is the right one.
+            self.loose_pull = float(self.loose[:, 0] @ reduced.clouds[1])
             left = step @ (self.linearised(shapes, lines).D + self.prior) @ step
             low, high = (middle, high) if left > max(held, 0.0) else (low, middle)
-        return self.loose
+        return True
 
     def _pull_of_shapes(self, values: gtsam.Values) -> Array:
         """(6n,) right-hand side `Reduced.c` at values that the shapes have followed."""

@@ -132,11 +132,11 @@ def export(
     """
     from caliv_graph.common.files import atomic_write, check_output_file
     from caliv_graph.export.consumers import export as export_to
-    from caliv_graph.export.prepare import Options, prepare
+    from caliv_graph.export.prepare import CONFIG_FILE, Options, prepare
     from caliv_graph.export.text import caveats
 
     # Not the base: to replace its numbers is what is asked for then.
-    inputs = [calibration, config, bag]
+    inputs = [calibration, config or calibration.parent / CONFIG_FILE, bag]
     check_output_file(out, force, inputs)
     options = Options(
         consumer=to,

@@ -43,6 +43,7 @@ def init(
 
     check_output_file(out, force, [data, urdf])
     draft = draft_config(data, out, urdf)
+    check_output_file(out, force, [draft.original])
     atomic_write(out, draft.text, force)
     streams.say(f"{out} written. LiDARs: {', '.join(draft.lidars)}")
     if draft.origin:

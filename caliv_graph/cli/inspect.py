@@ -58,9 +58,7 @@ def inspect(
     from caliv_graph.wording.inspection import untested_guesses_sentence
 
     if html is not None:
-        # An older page may lie in the folder of the drive; nothing is read from it.
-        folder = None if html.suffix == ".html" else data
-        check_output_file(html, force, [folder, config])
+        check_output_file(html, force, [data, config])
     recording, settings, warnings = _opened(data, config)
     seen = None
     with streams.progress_on_stdout(as_json) as progress:

@@ -109,6 +109,8 @@ def plan(
     if configs:
         _check_options(configs, poses)
         config = load_config(configs[0])
+        if out is not None:
+            check_output_file(out, force, [config.data.path, config.data.poses])
         goals = goals or config.limits
         check_guesses(config, configs[0])
         with streams.progress_on_stdout(as_json) as progress:

@@ -15,6 +15,12 @@ from typing import Any
 
 from caliv_graph.errors import ConfigError, OutputError
 
+WRITTEN = (".yaml", ".yml", ".html", ".htm", ".json", ".urdf", ".xml", ".xacro", ".py", ".sh")
+"""Files of commands, which people keep beside their recordings."""
+
+OF_A_BAG = ("metadata.yaml", "ego_pose.json")
+"""Those that recordings have themselves."""
+
 
 def atomic_write(path: Path, content: str | bytes, force: bool = False) -> None:
     """Writes a file in one step: a reader sees the old file or the new one.
@@ -58,7 +64,7 @@ def check_output_file(path: Path, force: bool = False, inputs: Sequence[Path | N
             raise OutputError(f"{path}: exists already. Give --force to replace it")
         if target.exists():
             for given, own in _all_resolved(inputs):
-                if target.is_relative_to(own):
+                if target == own or (target.is_relative_to(own) and _may_be_recorded(target)):
                     raise OutputError(
                         f"{path}: is not replaced, for it is {_input_in(given, target == own)}. "
                         "Give another name"
@@ -162,6 +168,11 @@ def check_output_folder(
 def _all_resolved(inputs: Sequence[Path | None]) -> list[tuple[Path, Path]]:
     """Each input that is given, and where it is."""
     return [(given, _resolved(given)) for given in inputs if given is not None]
+
+
+def _may_be_recorded(path: Path) -> bool:
+    """Whether a file in the folder of a recording may be part of it: no older output beside it."""
+    return path.suffix not in WRITTEN or path.name in OF_A_BAG
 
 
 def _input_in(given: Path, whole: bool) -> str:

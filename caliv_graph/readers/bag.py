@@ -46,7 +46,7 @@ _RECOVERY = {
 
 _BEGINNINGS = {
     ".mcap": ("an MCAP file", b"\x89MCAP0\r\n"),
-    ".bag": ("a bag of ROS 1", b"#ROSBAG V"),
+    ".bag": ("a bag of ROS 1", b"#ROS"),
     ".db3": ("an SQLite database", b"SQLite format 3\x00"),
 }
 """What a file of each suffix is, and what it begins with."""

@@ -22,7 +22,10 @@ def held_out_sentence(strips: int, before_mm: float, after_mm: float, before: st
 
 def level_sentence() -> str:
     """What strips of level ground alone test."""
-    return "All of them are level: they test z, roll and pitch, but not x, y and yaw."
+    return (
+        "All of them are level: they test z, roll and pitch, but not x, y and yaw, which walls or "
+        "the halves of the drive would test."
+    )
 
 
 def thick_sentence(kinds: str, lidars: Sequence[str]) -> str:

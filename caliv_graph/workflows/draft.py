@@ -57,12 +57,14 @@ class Draft:
         lidars: names of its LiDARs.
         unknown: keys that the user must fill in before calibrating.
         origin: a sentence about the source of the guesses; empty: there are none.
+        original: config of another program that they were read from.
     """
 
     text: str
     lidars: tuple[str, ...]
     unknown: tuple[str, ...]
     origin: str
+    original: Path | None = None
 
 
 def draft_config(data: Path, config: Path, urdf: Path | None = None) -> Draft:
@@ -123,7 +125,7 @@ def _draft_of_folder(data: Path, config: Path) -> Draft:
     taken = f"{what} taken from {original.path}" if original else ""
     if original and original.radians:
         taken += ", whose angles are radians by their size"
-    return Draft(text, sensors, (_HEIGHT,), taken)
+    return Draft(text, sensors, (_HEIGHT,), taken, original.path if original else None)
 
 
 def _draft_of_clouds(data: Path, config: Path, folders: Sequence[str]) -> Draft:

@@ -15,8 +15,9 @@ from caliv_graph.calibration.assemble import assemble
 from caliv_graph.calibration.estimate import estimate
 from caliv_graph.common.progress import Progress
 from caliv_graph.config.model import Config, StructureConfig
+from caliv_graph.conventions import AXES
 from caliv_graph.errors import RegistrationError, SolveError, TargetError
-from caliv_graph.fusion.compare import Comparison, compare
+from caliv_graph.fusion.compare import Comparison, Movement, compare
 from caliv_graph.fusion.terms import drive_digest
 from caliv_graph.odometry.run import needs_odometry
 from caliv_graph.pipeline import Prepared, prepare
@@ -170,7 +171,7 @@ def with_halves(found: Validation, calibration: Calibration, repeated: Repeatabi
     """
     p_value = CONTRADICTION / max(len(repeated.results), 1)
     alike: list[tuple[str, float]] = []
-    elsewhere = []
+    elsewhere, told = [], False
     for name, result in zip(repeated.halves, repeated.results, strict=False):
         if result.contradictions:
             continue
@@ -182,14 +183,20 @@ def with_halves(found: Validation, calibration: Calibration, repeated: Repeatabi
             elsewhere.append(elsewhere_sentence(name, max(off, key=lambda of: of.sigmas)))
         elif tested:
             alike.append((name, min(m.p_corrected for m in tested)))
+            told |= any(_tells_what_level_ground_does_not(m) for m in tested)
     if elsewhere:
         return replace(found, verdict=found.verdict.also(elsewhere, contradicts=True))
     if alike:
         verdict = found.verdict.also((alike_sentence(alike),))
-        # What level structure does not test, they do.
-        word = "good" if verdict.only_level else verdict.word
+        word = "good" if verdict.only_level and told else verdict.word
         return replace(found, verdict=replace(verdict, word=word, only_level=False))
     return found
+
+
+def _tells_what_level_ground_does_not(movement: Movement) -> bool:
+    """Whether x, y and yaw of one LiDAR against another were compared."""
+    axes = dict(zip(AXES, movement.determined, strict=True))
+    return len(movement.lidars) > 1 and axes["x"] and axes["y"] and axes["yaw"]
 
 
 def _calibrated(

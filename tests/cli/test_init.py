@@ -154,6 +154,17 @@ def test_a_config_is_replaced_only_with_force(drive: Path, tmp_path: Path) -> No
     assert load_config(out).lidars
 
 
+def test_the_config_that_guesses_were_read_from_is_not_replaced(drive: Path) -> None:
+    original = drive / "config.yaml"
+    original.write_text(ORIGINAL)
+
+    refused = init(drive, "--out", original, "--force")
+
+    assert isinstance(refused.exception, OutputError)
+    assert "it is what this command reads" in str(refused.exception)
+    assert original.read_text() == ORIGINAL
+
+
 def test_other_yaml_beside_the_data_is_not_touched_by_it(drive: Path, tmp_path: Path) -> None:
     (drive / "a.yaml").write_text("no: [yaml")
     (drive / "b.yaml").write_text("- a list")

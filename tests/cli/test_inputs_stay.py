@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from caliv_graph.cli.main import app
+from caliv_graph.common.files import check_output_file
 from caliv_graph.errors import OutputError
 
 
@@ -42,11 +43,23 @@ def test_what_is_read_stays(words: str, inputs: dict[str, str]) -> None:
     assert all(Path(path).read_text() == "mine" for path in inputs.values() if "." in path[-6:])
 
 
-def test_an_older_page_may_lie_in_the_folder_of_the_drive(
-    inputs: dict[str, str], tmp_path: Path
-) -> None:
-    page = tmp_path / "drive" / "page.html"
-    page.write_text("older")
-    arguments = ["inspect", inputs["drive"], "--html", str(page), "--force"]
+@pytest.mark.parametrize("name", ["page.html", "config.yaml", "vehicle.urdf"])
+def test_older_outputs_may_lie_in_the_folder_of_the_drive(name: str, tmp_path: Path) -> None:
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    for file in ("drive.mcap", "metadata.yaml", name):
+        (drive / file).write_text("older")
+    check_output_file(drive / name, True, [drive])
+    for file in ("drive.mcap", "metadata.yaml"):
+        with pytest.raises(OutputError, match="is part of"):
+            check_output_file(drive / file, True, [drive])
+
+
+def test_the_recording_of_a_config_stays(tmp_path: Path) -> None:
+    (tmp_path / "drive.mcap").write_text("mine")
+    config = tmp_path / "config.yaml"
+    config.write_text("data: {path: drive.mcap}\nlidars: {a: {topic: /a}}\n")
+    arguments = ["plan", str(config), "--out", str(tmp_path / "drive.mcap"), "--force"]
     result = CliRunner().invoke(app, arguments)
-    assert "reads" not in str(result.exception)  # the drive of this test is no bag
+    assert isinstance(result.exception, OutputError)
+    assert (tmp_path / "drive.mcap").read_text() == "mine"

@@ -11,11 +11,18 @@ import pytest
 
 from caliv_graph.common.progress import SilentProgress
 from caliv_graph.config.load import parse_config
+from caliv_graph.conventions import AXES
 from caliv_graph.products import TargetCloud, TargetObservation
 from caliv_graph.simulation.writer import config_of
 from caliv_graph.validation.clouds import Clouds
 from caliv_graph.validation.findings import Validation, Verdict
-from caliv_graph.workflows.repeatability import alternate, split, split_halves, with_halves
+from caliv_graph.workflows.repeatability import (
+    _tells_what_level_ground_does_not,
+    alternate,
+    split,
+    split_halves,
+    with_halves,
+)
 from scripts.benchmark_clocks import Late
 from tests.drives_with_chair import without_structure
 from tests.kept import KeptDrive
@@ -88,7 +95,13 @@ def test_halves_of_a_drive_agree() -> None:
     right = with_halves(VALIDATION, file, found).verdict
     assert (right.word, right.contradicts) == ("good", False)
     assert "agrees with that of this drive by every other scan (p " in right.sentences[-1]
-    # It tells what level structure leaves open, but no more than that.
+    # It tells what level structure leaves open, but no more than that; nothing of it where yaw
+    # stays open.
+    assert _tells_what_level_ground_does_not(pair)
+    open_yaw = tuple(axis != "yaw" for axis in AXES)
+    assert not _tells_what_level_ground_does_not(replace(pair, determined=open_yaw))
+    alone = found.comparison.lidars["front"]
+    assert not _tells_what_level_ground_does_not(replace(alone, determined=(True,) * 6))
     for only_level, word in ((True, "good"), (False, "unclear")):
         before = replace(VALIDATION.verdict, word="unclear", only_level=only_level)
         assert with_halves(replace(VALIDATION, verdict=before), file, found).verdict.word == word

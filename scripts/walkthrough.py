@@ -1,7 +1,4 @@
-"""From a bag to a localiser that carries the calibration; `# %%` are cells for editors.
-
-Run it in the folder of the checkout: its paths begin there.
-"""
+"""From a bag to a localiser; run it in the folder of the checkout. `# %%` are cells."""
 
 # %% A drive: your bag in out/walkthrough/drive, or a simulated one, 18 MB
 from pathlib import Path

@@ -21,6 +21,9 @@ MOST_NEXT = 2
 LEAST_NEXT = 3.0
 """Sigmas that a suspect must still explain, once the first is freed, to be named after it."""
 
+NEARLY = 0.75
+"""Part of the first suspect's sigmas from which another that explains the same is named with it."""
+
 
 def ranking_sentence(suspects: Sequence[Suspect], of_wheels: bool = False) -> str:
     """The first suspect, what it explains and what to do; then those that explain more.
@@ -35,8 +38,25 @@ def ranking_sentence(suspects: Sequence[Suspect], of_wheels: bool = False) -> st
     then = f"; next, with it freed: {others}" if others else ""
     return (
         f"most likely: {first.input}, {_by(first)}; it explains {100.0 * first.explains:.0f} "
-        f"percent of the contradiction ({first.sigmas:.0f} sigma){then}. {remedy(first)}"
+        f"percent of the contradiction ({first.sigmas:.0f} sigma){then}"
+        f"{_or_alike(first, rest)}. {remedy(first)}"
         f"{_or_axle(first) if of_wheels and first.input == 'gnss.lever_arm' else ''}"
+    )
+
+
+def _or_alike(first: Suspect, rest: Sequence[Suspect]) -> str:
+    """The suspect that explains nearly as much, and nothing more once the first is freed.
+
+    On an arc an antenna that is 1.5 m further ahead looks like a heading that is 9 degrees off. To
+    free the first of both when it is the second gives a result that nothing contradicts.
+    """
+    alike = [s for s in rest if s.sigmas > NEARLY * first.sigmas and s.sigmas_left <= LEAST_NEXT]
+    if not alike:
+        return ""
+    other = max(alike, key=lambda s: s.sigmas)
+    return (
+        f". {other.input}, {_by(other)}, explains it nearly as well ({other.sigmas:.0f} sigma): "
+        "the drive hardly tells them apart, so check both before one is freed"
     )
 
 

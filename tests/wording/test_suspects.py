@@ -44,6 +44,24 @@ def test_the_first_suspect_leads_and_what_remains_follows() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("sigmas", "left", "alike"),
+    [(34.0, 1.3, True), (30.0, 1.3, False), (34.0, 9.0, False)],
+    ids=["hardly told apart", "explains less", "explains something else"],
+)
+def test_an_input_that_explains_nearly_as_much_is_named(
+    sigmas: float, left: float, alike: bool
+) -> None:
+    rest = [suspect("lidars.rear.time_offset", 33.0, 0.0), suspect("imu.time_offset", sigmas, left)]
+    if not alike:
+        del rest[0]
+    text = ranking_sentence([ARM, *rest])
+    late = "imu.time_offset, the stamps are 0.100 +- 0.010 s late"
+    assert (f"{late}, explains it nearly as well ({sigmas:.0f} sigma)" in text) == alike
+    assert ("hardly tells them apart" in text) == alike
+    assert text.endswith("or set gnss.lever_arm: null")
+
+
 def test_a_coordinate_that_is_not_determined_has_no_number() -> None:
     flat = replace(ARM, determined=(True, True, False))
     assert ranking_sentence([flat]).startswith(

@@ -485,18 +485,21 @@ class _Loop:
         if way @ information @ way < LOOSE_WAY_SIGMAS**2:
             return False
         step = way / np.sqrt(way @ information @ way)
-        pulls = [self._pull_of_shapes(reduced.move(of)) for of in (0.0 * step, step)]
-        held = float(step @ (pulls[0] - pulls[1]) + step @ self.prior @ step)
+        still = np.zeros_like(step)
+        here, there = (self._pull_of_shapes(reduced.move(to)) for to in (still, step))
+        held = float(step @ (here - there) + step @ self.prior @ step)
         if held > MOSTLY_HELD:
             return False
-        motion = reduced.moved_clouds(step) - reduced.moved_clouds(0.0 * step)
+        motion = reduced.moved_clouds(step) - reduced.moved_clouds(still)
+        others = self.directions(shapes, lines)
         low, high = np.log(LOOSE_SIGMAS)
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
             self.loose = np.exp(middle) * motion[:, None]
             # The clouds pull as they did: at the end of EM their gradient is the right one.
             self.loose_pull = float(self.loose[:, 0] @ reduced.clouds[1])
-            left = step @ (self.linearised(shapes, lines).D + self.prior) @ step
+            found = self.linearised(shapes, lines, np.hstack([others, self.loose]))
+            left = step @ (found.D + self.prior) @ step
             low, high = (middle, high) if left > max(held, 0.0) else (low, middle)
         return True
 

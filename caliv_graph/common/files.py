@@ -62,13 +62,14 @@ def check_output_file(path: Path, force: bool = False, inputs: Sequence[Path | N
             raise OutputError(f"{path}: is a folder. Give the name of a file")
         if target.exists() and not force:
             raise OutputError(f"{path}: exists already. Give --force to replace it")
-        if target.exists():
-            for given, own in _all_resolved(inputs):
-                if target == own or (target.is_relative_to(own) and _may_be_recorded(target)):
-                    raise OutputError(
-                        f"{path}: is not replaced, for it is {_input_in(given, target == own)}. "
-                        "Give another name"
-                    )
+        for given, own in _all_resolved(inputs) if target.exists() else ():
+            if target == own:
+                read = "what this command reads"
+            elif target.is_relative_to(own) and _may_be_recorded(target):
+                read = f"part of {given}, which this command reads"
+            else:
+                continue
+            raise OutputError(f"{path}: is not replaced, for it is {read}. Give another name")
         _check_parent_writable(path, target)
 
 
@@ -173,11 +174,6 @@ def _all_resolved(inputs: Sequence[Path | None]) -> list[tuple[Path, Path]]:
 def _may_be_recorded(path: Path) -> bool:
     """Whether a file in the folder of a recording may be part of it: no older output beside it."""
     return path.suffix not in WRITTEN or path.name in OF_A_BAG
-
-
-def _input_in(given: Path, whole: bool) -> str:
-    """What a file is that is an input as a `whole`, or else part of one."""
-    return "what this command reads" if whole else f"part of {given}, which this command reads"
 
 
 def _belongs(entry: Path, folder: Path, content: Sequence[str]) -> bool:

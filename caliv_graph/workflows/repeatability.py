@@ -188,8 +188,9 @@ def with_halves(found: Validation, calibration: Calibration, repeated: Repeatabi
         return replace(found, verdict=found.verdict.also(elsewhere, contradicts=True))
     if alike:
         verdict = found.verdict.also((alike_sentence(alike),))
-        word = "good" if verdict.only_level and told else verdict.word
-        return replace(found, verdict=replace(verdict, word=word, only_level=False))
+        if verdict.only_level and told:
+            verdict = replace(verdict, word="good", only_level=False)
+        return replace(found, verdict=verdict)
     return found
 
 
